@@ -32,12 +32,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
-from ssad.core.machine import keep_memory
+from ssad.core.machine import retain_freed_memory
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.victim import Victim, steady
-from ssad.training.batches import PictureSet, move
+from ssad.training.batches import ImageSet, move
 from ssad.training.data import nuscenes_items
 from ssad.training.detector import coco_items
 
@@ -76,7 +76,7 @@ class ForArt(nn.Module):
 def score(detector: Any, images: Tensor, truth: Sequence[Truth]) -> float:
     """AP50 of a batch, after an 8-bit round trip."""
     stored = (images * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
-    return score_2d(detector, PictureSet(stored, tuple(truth)))["AP50"]
+    return score_2d(detector, ImageSet(stored, tuple(truth)))["AP50"]
 
 
 def beside_art(folder: Path, count: int, steps: int) -> dict[str, Any]:
@@ -330,7 +330,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    keep_memory()  # as workers do
+    retain_freed_memory()  # as workers do
     if chosen.what == "torchattacks":
         found = beside_torchattacks(chosen.steps)
     elif chosen.what == "art":

@@ -176,13 +176,13 @@ def measure(driver: Driver, selection: FreaSelection, ego: str) -> dict[str, Any
     alive = [base for base in bases if base.trace.end != "collision"]
     found = trials.run([(base, Proposal(base.scenario, drivers={selection: driver})) for base in alive])
     rows = {
-        base.scenario.name: [float(o.trace is not None and o.trace.end == "collision"), float(o.valid)]
+        base.scenario.name: [float(o.trace is not None and o.trace.end == "collision"), float(o.is_valid)]
         for base, o in zip(alive, found, strict=True)
     }
     made = [
         (scenario_of(o, base, name=base.scenario.name), base.graph, base.episode.seed + 1)
         for base, o in zip(alive, found, strict=True)
-        if o.valid
+        if o.is_valid
     ]
     again = [base for base in trials.bases(made) if base.trace.end == "collision"] if made else []
     collisions: dict[str, list[float]] = {}

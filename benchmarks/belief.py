@@ -49,7 +49,7 @@ class SeenOnly(LineOfSight):
     def believe(self, view: Observation) -> Belief:
         """Pose, speed, size and kind of what is in sight."""
         belief = super().believe(view)
-        return replace(belief, forecast=None, way=None, line_signal=None, stood=None, gives_way=None)
+        return replace(belief, forecast=None, way=None, line_signal=None, standing_time=None, gives_way=None)
 
 
 SYSTEMS: dict[str, Driver] = {

@@ -10,7 +10,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.drivers import make_system
 from ssad.drivers.careful.grade import Grade, grade_collision
 from ssad.drivers.careful.models import MODELS
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--scenarios", default="precrash", help="a set, a type, a name or a YAML file")
     parser.add_argument("--write", action="store_true", help="put the table into docs/results/careful-drivers.md")
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     text = table(given.system, given.scenarios)
     print(text)
     if given.write:

@@ -11,10 +11,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import AgentKind
 from ssad.drivers import make_system
-from ssad.experiments.adversarial.collision_view import found_view
+from ssad.experiments.adversarial.collision_view import draw_collision
 from ssad.training.driver import draw_episodes, find_scenarios
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -32,7 +32,7 @@ SIZE = 420  # pixels
 
 def main() -> None:
     """Drive, draw and write."""
-    quiet_warp()
+    start_warp_quietly()
     figure, axes = plt.subplots(2, len(VIEWS), figsize=(12.5, 5.4), layout="constrained")
     for column, (name, kind) in enumerate(VIEWS.items()):
         scenarios, graphs = find_scenarios([f"{kind}/00"])
@@ -44,7 +44,7 @@ def main() -> None:
             others = [int(k) for k in np.flatnonzero((trace.kind != AgentKind.PROP) & (span > 1.0)) if k]
             gap = np.hypot(*(part[:, others] - part[:, :1] for part in (trace.x, trace.y))).min(1)
             last = None if trace.contact.any() else int(gap.argmin())
-            picture = found_view(trace, graph, others, size=SIZE, last_step=last)
+            picture = draw_collision(trace, graph, others, size=SIZE, last_step=last)
             axis = axes[row, column]
             axis.imshow(picture)
             axis.set_axis_off()

@@ -24,9 +24,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from ssad import World, build_episode, load_scenarios, load_town, make_system
-from ssad.core.machine import quiet_warp, versions
-from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, nuscenes_cameras
+from ssad.core.machine import start_warp_quietly, versions
+from ssad.drivers.perceiving.driver import PerceivingDriver
+from ssad.drivers.perceiving.perceivers import CameraPerceiver, nuscenes_cameras
 from ssad.rendering.onboard import Onboard
 from ssad.world.rollout import Loop
 
@@ -85,15 +85,15 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     cuda = device.startswith("cuda")
     cameras = nuscenes_cameras(width, channels)
     options = {} if inside is None else {"input_width": min(inside, width)}
-    eyes = CameraEyes(detector, cameras, **options)
-    driver = Perceiving(eyes, rate=rate)
+    eyes = CameraPerceiver(detector, cameras, **options)
+    driver = PerceivingDriver(eyes, rate=rate)
     driver.to(device)
     scenarios = load_scenarios("natural-twinford")
     town = load_town(scenarios[0].town)
     episodes = [build_episode(scenarios[k % len(scenarios)], town, seed=k) for k in range(scenes)]
     onboard = Onboard(device=device, resident=True)
     world = World(episodes, {town.name: town}, device=device)
-    loop = Loop(world, {0: driver}, sensors=onboard.together(cameras), policies=make_system)
+    loop = Loop(world, {0: driver}, sensors=onboard.group_cameras(cameras), policies=make_system)
     loop.reset()
     watch = Stopwatch(torch.cuda.synchronize if cuda else lambda: None)
     watch.around("views", onboard, "view")
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, help="another number of scenes")
     parser.add_argument("--json", type=Path, help="where the results are written")
     args = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     found = []
     for name in args.case:
         found.append(

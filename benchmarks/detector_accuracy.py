@@ -35,9 +35,9 @@ from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import box_table, detect, detect_2d, score_figures
 from ssad.metrics.detection import BoxTable, filter_boxes, match, scene_intervals
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
-from ssad.recorders.target_images import clip_views
+from ssad.recorders.target_images import recorded_views
 from ssad.recorders.viewpoints import weather_name
-from ssad.rendering.camera.labels import label_picture
+from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.sensor import BRIGHTEST, noise_levels
 from ssad.training.detector import describe_data
@@ -57,7 +57,7 @@ SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detec
 
 
 def weather_of(description: str) -> str:
-    """Day, night, wet ... of a scene, from the words that `ssad.recorders.nuscenes.weather_words` writes."""
+    """Day, night, wet ... of a scene, from the words that `ssad.recorders.nuscenes.describe_weather` writes."""
     found = re.search(r"sun (\d+) degrees (above|below) the horizon, clouds (\d+) %", description)
     if found is None:
         raise SystemExit(f"a scene tells no weather: {description}")
@@ -123,13 +123,13 @@ class TargetRecording:
         wanted = {self.files[number] for number in np.unique(self.image[small])}
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
-            for one in clip_views(folder, split="test", selected_keys=names):
+            for one in recorded_views(folder, split="test", selected_keys=names):
                 picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, objects=())])
                 light, behind = (
                     np.minimum(p.radiance[0] * p.exposure[0], BRIGHTEST).mean(-1) for p in (picture, street)
                 )
                 photons, dark = noise_levels(one.view.sensor.noise, float(picture.exposure[0]))
-                labels = label_picture(one.scene, one.view, picture)
+                labels = label_image(one.scene, one.view, picture)
                 for row in np.flatnonzero(small & (self.image == shown[folder / "images" / one.file])):
                     own = picture.tag[0] == labels.tag[np.abs(labels.box - self.box[row]).max(1).argmin()]
                     noise = np.sqrt(np.mean(photons * behind[own] + dark**2))

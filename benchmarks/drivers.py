@@ -25,7 +25,7 @@ from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import Episode
 from ssad.drivers import LEARNED, make_system
 from ssad.drivers import SYSTEMS as REGISTERED
-from ssad.experiments.scenario_kind import route_of
+from ssad.experiments.scenario_kind import route_key
 from ssad.metrics import CaseValue, Estimate, episode_metrics, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.scenarios.dynamic.generate import Trials
@@ -53,7 +53,7 @@ def episodes_of(name: str) -> tuple[list[Episode], dict[str, Any]]:
 
 def case(episode: Episode, value: float) -> CaseValue:
     """Return a value of an episode; its cluster is its route with all draws of traffic."""
-    return CaseValue(float(value), route_of(episode.scenario), episode.key)
+    return CaseValue(float(value), route_key(episode.scenario), episode.key)
 
 
 def plain(estimated: Estimate) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def measured(episodes: Sequence[Episode], found: Sequence[Outcome], natural: Seq
 
     values = {
         "CR": [crashed(o) for o in found],
-        "valid": [o.valid for o in found],
+        "valid": [o.is_valid for o in found],
         "off": [o.off_road for o in found],
         "others": [o.hit_others for o in found],
     }

@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -39,7 +39,10 @@ ALONE = ("asam-qc-openscenarioxml", "asam-qc-opendrive")
 
 
 def _environment(name: str) -> dict[str, str]:
-    return os.environ | {"UV_PROJECT_ENVIRONMENT": str(home() / "environments" / name), "PYTHONPATH": str(ROOT / "src")}
+    return os.environ | {
+        "UV_PROJECT_ENVIRONMENT": str(home_folder() / "environments" / name),
+        "PYTHONPATH": str(ROOT / "src"),
+    }
 
 
 def _run(name: str, more: list[str]) -> int:
@@ -58,7 +61,7 @@ def _run(name: str, more: list[str]) -> int:
 
 def _asam(more: list[str]) -> int:
     """The checkers of ASAM on the path of this environment's tests."""
-    folder = home() / "environments" / "asam"
+    folder = home_folder() / "environments" / "asam"
     subprocess.run(["uv", "venv", "--quiet", "--allow-existing", "--python", "3.11", folder], check=True)
     subprocess.run(
         ["uv", "pip", "install", "--quiet", *ALONE], env=os.environ | {"VIRTUAL_ENV": str(folder)}, check=True

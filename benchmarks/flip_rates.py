@@ -20,7 +20,7 @@ from typing import Any
 from benchmarks.world_ratio import commit
 from ssad.core.errors import ConfigError
 from ssad.experiments.runs import kind_of_run
-from ssad.experiments.sample_size import REFERENCE, measured
+from ssad.experiments.sample_size import REFERENCE, reference_entry
 from ssad.report.load import Run, load_run
 from ssad.scenarios.dynamic import load_scenarios
 
@@ -33,10 +33,10 @@ def measurements(run: Run) -> Iterator[dict[str, Any]]:
     names = {
         reference: [scenario.name for scenario in load_scenarios(reference)] for reference in run.suite["scenarios"]
     }
-    yield measured(run, kind, list(names), [name for part in names.values() for name in part])
+    yield reference_entry(run, kind, list(names), [name for part in names.values() for name in part])
     if len(names) > 1:
         for reference, part in names.items():
-            yield measured(run, kind, [reference], part)
+            yield reference_entry(run, kind, [reference], part)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.seeding import generator
 from ssad.drivers import make_system
 from ssad.metrics.rare_events import weighted_limits
@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("--splittings", type=int, default=40)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     {"brute": brute, "coverage": coverage}[given.what](given)
 
 

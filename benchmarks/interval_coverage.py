@@ -214,10 +214,10 @@ def stream(*key: object) -> np.random.Generator:
 
 def natural_sizes() -> F64:
     """[38] cases on each route of the set `natural`, in ascending order."""
-    from ssad.experiments.scenario_kind import route_of
+    from ssad.experiments.scenario_kind import route_key
     from ssad.scenarios.dynamic import load_scenarios
 
-    return np.sort(np.array([*Counter(map(route_of, load_scenarios("natural"))).values()], np.float64))
+    return np.sort(np.array([*Counter(map(route_key, load_scenarios("natural"))).values()], np.float64))
 
 
 def route_layout(routes: int, natural: F64) -> Clusters:

@@ -22,11 +22,11 @@ from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.safeio import write_atomic
 from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
-from ssad.scenarios.dynamic.catalog import PRECRASH
+from ssad.scenarios.dynamic.catalogue import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
-from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
-from ssad.scenarios.dynamic.knowledge._remember import remembered
-from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
+from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap_scalar
+from ssad.scenarios.dynamic.knowledge.natural_junction import spawn_candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
 from ssad.world.roads import load_town
@@ -75,7 +75,7 @@ class Stretch:
 def _pose(graph: LaneGraph, lane: int, s: float) -> Pose:
     """A pose on a lane, rounded so that the files stay readable (1 cm, 0.01 degrees)."""
     x, y, yaw, _ = graph.at(lane, s)
-    return Pose(round(x, 2) + 0.0, round(y, 2) + 0.0, round(wrap(yaw), 4) + 0.0)
+    return Pose(round(x, 2) + 0.0, round(y, 2) + 0.0, round(wrap_scalar(yaw), 4) + 0.0)
 
 
 def _clear(graph: LaneGraph, lane: int) -> bool:
@@ -106,7 +106,7 @@ def _along(graph: LaneGraph, lanes: list[int], s: float) -> Pose:
 
 def stretches(graph: LaneGraph, length: float, trigger: float) -> Iterator[Stretch]:
     """Ways of `length` m on driving lanes outside junctions, one every 20 m along each lane."""
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         if not _clear(graph, lane):
             continue
         for start in np.arange(_MARGIN, float(graph.length[lane]), 20.0).tolist():
@@ -143,7 +143,7 @@ def _left_of(graph: LaneGraph, stretch: Stretch, *, same: bool) -> bool:
     """Whether each lane of a stretch has a driving lane to its left that runs the same (the other) way."""
     for lane in stretch.lanes:
         left = int(graph.left[lane])
-        if left < 0 or graph.kind[left] != LaneType.DRIVING or graph.same_direction(lane, left) != same:
+        if left < 0 or graph.kind[left] != LaneType.DRIVING or graph.is_same_direction(lane, left) != same:
             return False
     return True
 
@@ -171,10 +171,10 @@ def _pool(graph: LaneGraph, kind: str) -> list[Stretch]:
 def _look(graph: LaneGraph, stretch: Stretch) -> tuple[bool, bool, str]:
     """What kind of road a stretch is: bent, more than one lane a direction, which turn."""
     a, b = stretch.points[0], stretch.points[-1]
-    bent = stretch.turn is None and abs(wrap(b.yaw - a.yaw)) > math.radians(20.0)
+    bent = stretch.turn is None and abs(wrap_scalar(b.yaw - a.yaw)) > math.radians(20.0)
     lane = stretch.lanes[0]
     beside = [int(n) for n in (graph.left[lane], graph.right[lane]) if n >= 0]
-    wide = any(graph.kind[n] == LaneType.DRIVING and graph.same_direction(lane, n) for n in beside)
+    wide = any(graph.kind[n] == LaneType.DRIVING and graph.is_same_direction(lane, n) for n in beside)
     return bent, not wide, stretch.turn or ""
 
 
@@ -235,14 +235,14 @@ def precrash(graph: LaneGraph, routes: int = 4, *, prefix: str = "", least: int 
     return result
 
 
-@remembered(16)
+@cached_by_identity(16)
 def junction_routes(graph: LaneGraph, routes: int) -> tuple[Stretch, ...]:
     """Routes through junctions, turns in rotation, on which traffic has room."""
     from ssad.world.roads import route_along
 
     def works(stretch: Stretch) -> bool:
         try:
-            found = candidates(graph, route_along(graph, stretch.points))
+            found = spawn_candidates(graph, route_along(graph, stretch.points))
         except RouteError:
             return False
         return len(found) >= 4

@@ -20,12 +20,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.lit_images import LightableClips, LitClip
+from ssad.experiments.perception.physical.lit_images import RelightableImage, RelightableTargetImages
 from ssad.experiments.perception.physical.target_views import drive_of
 from ssad.metrics.target_attacks import sightings, target_scores
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import render
@@ -39,21 +39,21 @@ TOWN, HOURS = "Oldmarket", ("noon", "low_sun", "sun_behind", "night")
 SUNLIT = 0.2  # share of the sun in the light on the rear, from which on a shadow could be seen
 
 
-def rear(clip: LitClip) -> tuple[float, float]:
+def rear(clip: RelightableImage) -> tuple[float, float]:
     """Share of the sun in the light on the target's rear, and lux there; medians over its pixels."""
     picture = clip.lit()
     back = -0.5 * clip.target.length
     on_it = ((picture.position[..., 0] - back).abs() < 0.3) & (picture.normal[..., 0] < -0.7)
-    surface = render(clip.scene, [clip.clip.view], surface=True).surface
+    surface = render(clip.scene, [clip.view.view], surface=True).surface
     assert surface is not None
     (top, left), (high, wide) = picture.corner, picture.radiance.shape[:2]
     light = surface.irradiance[0, top : top + high, left : left + wide][on_it.numpy()].mean(-1)
     whole = picture.radiance[on_it].mean(-1)
     sun = picture.sun[on_it].mean(-1) / whole.clamp_min(1e-9)
-    return float(sun.median()), float(np.median(light)) / per_lux(clip.clip.view.weather)
+    return float(sun.median()), float(np.median(light)) / per_lux(clip.view.view.weather)
 
 
-def flood(clip: LitClip) -> SceneEdit:
+def flood(clip: RelightableImage) -> SceneEdit:
     """The brightest lamp on the whole rear, white."""
     values = {
         "lumens": 3000.0,
@@ -70,13 +70,15 @@ def flood(clip: LitClip) -> SceneEdit:
     return Flashlight().edit(values, clip.target)
 
 
-def scores(pictures: LightableClips, clips: list[LitClip], detector: Any, edit: Any) -> dict[str, float | None]:
+def scores(
+    pictures: RelightableTargetImages, clips: list[RelightableImage], detector: Any, edit: Any
+) -> dict[str, float | None]:
     """AP50 and mean score of the target under an edit of each picture."""
 
     def shown() -> Any:
         for clip in clips:
             image = torch.from_numpy(clip.render(edit(clip))).to(pictures.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(clip.clip.row), image, pictures.lit_truth(clip)
+            yield drive_of(clip.view.row), image, pictures.lit_truth(clip)
 
     metrics = target_scores(list(sightings(detector, shown())), replicates=0)["metrics"]
     return {name: metrics[name] for name in ("AP50", "confidence")}
@@ -90,24 +92,24 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--home", type=Path, default=Path("runs/physical-lights/data"))
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     home = given.home / TOWN
     if not (home / "annotations").is_dir():
-        record_clips(
+        record_target_images(
             TargetRecording(home, ((TOWN, given.pictures),), (), target=TargetCar(), device=given.device), workers=0
         )
     detector = make_detector("yolov5n", device=given.device)
     rows = []
     for hour in HOURS:
-        pictures = LightableClips(home, given.pictures, tuple(detector.classes), given.device)
-        clips = list(pictures.clips_at(hour))[:: given.every]
+        pictures = RelightableTargetImages(home, given.pictures, tuple(detector.classes), given.device)
+        clips = list(pictures.images_at(hour))[:: given.every]
         sun, lux = np.array([rear(clip) for clip in clips]).T
         none = SceneEdit(cards=(BLIND,))
         row: dict[str, Any] = {
             "hour": hour,
             "pictures": len(clips),
-            "drives": len({drive_of(clip.clip.row) for clip in clips}),
+            "drives": len({drive_of(clip.view.row) for clip in clips}),
             "sunlit": float((sun > SUNLIT).mean()),
             "sun": float(sun.max()),
             "lux": float(np.median(lux)),

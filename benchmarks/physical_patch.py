@@ -25,11 +25,11 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Truth
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
 from ssad.metrics.target_attacks import sightings, target_scores
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.target import TargetCar
@@ -103,11 +103,13 @@ VARIANTS = {
 ORDER = {name: number for number, name in enumerate(VARIANTS)}
 
 
-def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> TargetClips:
+def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> RecordedTargetImages:
     """Pictures of a town, recorded if they are not there."""
     if not (home / town / "annotations").is_dir():
-        record_clips(TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0)
-    return TargetClips(home / town, count, classes, device)
+        record_target_images(
+            TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0
+        )
+    return RecordedTargetImages(home / town, count, classes, device)
 
 
 def shown(
@@ -189,7 +191,7 @@ def main() -> None:
     parser.add_argument("--join", type=Path, nargs="*", default=[], metavar="FILE", help="add rows, measure nothing")
     given = parser.parse_args()
     rows = json.loads(given.out.read_text()) if given.out.is_file() else []
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
 
     def add(row: dict[str, Any]) -> None:

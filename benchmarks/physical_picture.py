@@ -16,11 +16,11 @@ import numpy as np
 import torch
 
 from ssad.core.images import save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_sheet import target_sheet
-from ssad.experiments.perception.physical.target_views import TargetClips
-from ssad.recorders.target_images import record_clips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical import albedo_of, control, make_carrier
@@ -41,11 +41,11 @@ PANELS = {
 @torch.no_grad()
 def main() -> None:
     """Record, show, write."""
-    quiet_warp()
+    start_warp_quietly()
     detector, target = make_detector(DETECTOR), TargetCar()
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
-        clips = TargetClips(Path(folder), 1, tuple(detector.classes))
+        record_target_images(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
+        clips = RecordedTargetImages(Path(folder), 1, tuple(detector.classes))
         ((_, clean, truth),) = clips.clean()
         shown = []
         for title, texture in PANELS.items():

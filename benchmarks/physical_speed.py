@@ -23,10 +23,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.target_views import TargetClips
-from ssad.recorders.target_images import record_clips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Situation, make_objective
@@ -85,9 +85,11 @@ def measure(count: int, device: str) -> dict[str, Any]:
     target = TargetCar()
     surface = Camouflage().on(target.mesh())
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0)
+        record_target_images(
+            TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0
+        )
         detector = make_detector("yolov5n", device=device)
-        clips = TargetClips(Path(folder), count, tuple(detector.classes), device)
+        clips = RecordedTargetImages(Path(folder), count, tuple(detector.classes), device)
         views = [view for _, view in clips.wearing(surface)]
     colour = control("random", surface.size).to(device).requires_grad_()
     batch = 1 if device == "cpu" else BATCH
@@ -120,7 +122,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     found = measure(given.images, given.device)
     text = json.dumps(found, indent=1) + "\n"

@@ -11,7 +11,8 @@
 4. All drive what was found in the other towns, but nobody what was found against the same seed: an ego collides in that
    by selection. They also drive natural traffic and the pre-crash set as they are, and are attacked anew.
 
-Each base scenario is a cluster, its value the mean over seeds; differences are paired by base.
+Each base scenario is a cluster, in natural traffic each route; its value is the mean over seeds, and differences are
+paired by base.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def found_files(out: Path, part: str, size: Size) -> list[str]:
 
 def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     """Search the bases that fall to one ego, and save the distinct collisions."""
-    from ssad.experiments.adversarial.search_scores import MOVING, distinct
+    from ssad.experiments.adversarial.search_scores import MOVING, distinct_collisions
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
@@ -134,7 +135,7 @@ def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     for base, row in zip(bases, rows, strict=True):
         good = [o for o in row if o.valid and o.ego_speed is not None and o.ego_speed > MOVING]
         hits += bool(good)
-        for n, outcome in enumerate(distinct(good)[:3]):
+        for n, outcome in enumerate(distinct_collisions(good)[:3]):
             made.append(scenario_of(outcome, base, name=f"{base.scenario.name}/{generator}-{n}-ego-{seed}"))
     if made:
         save_scenarios(out / "found" / f"{part}-{generator}-{seed}.yaml", made)
@@ -147,13 +148,13 @@ def search_all(
 ) -> tuple[list[Any], list[Any]]:
     """Bases that a system survives and a generator can change, and the outcomes of each."""
     from ssad.drivers import make_system
-    from ssad.experiments.adversarial.found_collisions import refusal
+    from ssad.experiments.adversarial.found_collisions import refusal_reason
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
 
     trials = Trials(lambda: make_system(system), make_system)
     factory = generator_factory(generator)
     bases = [trials.base(scenario, graphs[scenario.town], seed=seed) for scenario in scenarios]
-    bases = [base for base in bases if base.trace.end != "collision" and not refusal(factory, base.episode)]
+    bases = [base for base in bases if base.trace.end != "collision" and not refusal_reason(factory, base.episode)]
     if not bases:
         return [], []
     made = factory(bases, seeds=[seed] * len(bases), budget=budget)
@@ -217,9 +218,9 @@ def work(out: Path, size: Size, function: Callable[..., None], arguments: tuple[
     """One task; its processor time, s."""
     import torch
 
-    from ssad.core.machine import quiet_warp
+    from ssad.core.machine import start_warp_quietly
 
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     began = time.process_time()
     function(out, size, *arguments)
@@ -262,7 +263,8 @@ def own(name: str) -> int:
 
 
 def cases(values: dict[str, list[Any]], column: int | None = None) -> dict[str, Any]:
-    """A mean over seeds for each scenario; clusters are base scenarios."""
+    """Return a mean over seeds for each scenario; its cluster is the base scenario, or the route of natural traffic."""
+    from benchmarks.avoidable import cluster
     from ssad.metrics import CaseValue
 
     found = {}
@@ -271,22 +273,28 @@ def cases(values: dict[str, list[Any]], column: int | None = None) -> dict[str, 
         if not kept:
             continue
         base = "/".join(name.split("/")[:-1]) if "-ego-" in name else name
-        found[name] = CaseValue(float(np.mean(kept)), base, name)
+        found[name] = CaseValue(float(np.mean(kept)), cluster(base), name)
     return found
 
 
 def table(data: dict[str, Any]) -> list[str]:
     """What each arm does where, and how much less than before and than the control."""
     from ssad.metrics import Estimate, estimate, paired_difference
+    from ssad.metrics.intervals import MIN_ROUTES
 
     def text(found: Estimate, *, sign: bool = False) -> str:
         form = "+.3f" if sign else ".3f"
+        if found.method == "range":
+            return f"{found.mean:{form}} ({found.low:{form}} to {found.high:{form}} over {found.clusters} clusters)"
         return f"{found.mean:{form}} [{found.low:{form}}, {found.high:{form}}]"
 
     def line(what: str, part: dict[str, Any], column: int | None = None) -> str:
         arms = {arm: cases(part[arm], column) for arm in ARMS}
-        shown = [text(estimate(arms[arm].values(), "bounded")) for arm in ARMS]
-        differences = [text(paired_difference(arms["after"], arms[arm]), sign=True) for arm in ("before", "control")]
+        shown = [text(estimate(arms[arm].values(), "bounded", min_clusters=MIN_ROUTES)) for arm in ARMS]
+        differences = [
+            text(paired_difference(arms["after"], arms[arm], min_clusters=MIN_ROUTES), sign=True)
+            for arm in ("before", "control")
+        ]
         wins = sum(
             (mean_of(part["after"], s, column) or 0.0) < (mean_of(part["before"], s, column) or 0.0)
             for s in range(data["size"]["seeds"])

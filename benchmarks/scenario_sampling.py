@@ -88,12 +88,12 @@ def measure_apart(source: Path, count: int) -> dict[str, dict[str, float]]:
 
 def drive(episodes: Sequence[Episode], system: str) -> list[EpisodeTrace]:
     """What happens in the episodes with a driving system by name."""
-    from ssad.core.machine import quiet_warp
+    from ssad.core.machine import start_warp_quietly
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    quiet_warp()
+    start_warp_quietly()
     return rollout(World(episodes, {e.town: load_town(e.town) for e in episodes}), make_system(system))
 
 

@@ -43,9 +43,9 @@ def measure(name: str, *, system: str, set_name: str, seeds: int, budget: int) -
     roots = [seed for _ in alive for seed in range(seeds)]
     outcomes = search(factory(many, seeds=roots, budget=budget), many, trials, budget=budget)
     for base, row in zip(many, outcomes, strict=True):
-        first = next((k for k, outcome in enumerate(row, 1) if outcome.valid), None)
+        first = next((k for k, outcome in enumerate(row, 1) if outcome.is_valid), None)
         found.setdefault(base.scenario.name, []).append(first)
-        share.setdefault(base.scenario.name, []).append(float(np.mean([outcome.valid for outcome in row])))
+        share.setdefault(base.scenario.name, []).append(float(np.mean([outcome.is_valid for outcome in row])))
     return {"first": found, "share": share}
 
 

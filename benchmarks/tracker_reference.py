@@ -23,7 +23,7 @@ import numpy as np
 
 from ssad.core.perception import I64, Objects
 from ssad.core.types import F64, AgentKind
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, TrackerSettings
 from ssad.metrics.tracking import TrackedFrame, TrackScores, track_scores
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,7 +47,7 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
 
     from ssad import World, build_episode, load_town, make_system, rollout
     from ssad.core.rotations import upright_pose
-    from ssad.drivers.perceiving.eyes import nuscenes_cameras, project_boxes
+    from ssad.drivers.perceiving.perceivers import nuscenes_cameras, project_boxes
     from ssad.metrics.perception_in_drive import in_view
     from ssad.rendering.onboard import Onboard
     from ssad.world.models import MODELS
@@ -127,9 +127,9 @@ def overlap(one: F64, other: F64) -> F64:
     return np.asarray(common / np.maximum(area[0][:, None] + area[1] - common, 1e-9))
 
 
-def settings(density: float) -> Tracking:
+def settings(density: float) -> TrackerSettings:
     """Of SSAD's tracker in pixels."""
-    return Tracking(
+    return TrackerSettings(
         confirm=CONFIRM, reserve=RESERVE, high=HIGH, low=LOW, stranger=0.0, density=density, speed=6.0 * SCALE
     )
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.insert import insert
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.seeding import generator
 from ssad.core.types import (
     Controller,
@@ -35,7 +35,7 @@ from ssad.core.types import (
     Scenario,
     SignalState,
 )
-from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
 from ssad.world.roads import load_town, random_route
@@ -98,7 +98,7 @@ def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: in
         if any(math.hypot(a.pose.x - x, a.pose.y - y) < APART for a in agents):
             continue
         body = str(draws.choice(list(BODIES), p=list(BODIES.values())))
-        body = body if fits(body, route) else "compact"
+        body = body if fits_route(body, route) else "compact"
         wish = float(draws.uniform(0.75, 1.05)) * float(route.speed_limit.max())
         start = 0.6 * min(wish, float(route.speed_limit[0]))
         pose = Pose(x, y, float(route.yaw[0]))
@@ -122,7 +122,7 @@ def between_lanes(graph: LaneGraph, place: Mapping[str, float]) -> bool:
     """
     side = 0.5 * np.array([-math.sin(place["yaw"]), math.cos(place["yaw"])])
     here = np.array([place["x"], place["y"]])
-    return bool(LaneQuery(graph).nearest([here + side, here - side]).inside.all())
+    return bool(LaneQuery(graph).nearest([here + side, here - side]).is_inside.all())
 
 
 def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, device: str = "cpu") -> dict[str, Any]:
@@ -221,7 +221,7 @@ def main() -> None:
     parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json whose towns are added")
     parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
     about = traffic_of | {"first": given.first}
     rows = kept(given.json, about) if given.json and given.json.is_file() else {}

@@ -55,7 +55,7 @@ class OwnDetector(nn.Module):
     ) -> list[Detections]:
         """Boxes above the threshold, sorted by score, after non-maximum suppression per class."""
         least = check_threshold(self.name, 0.3 if threshold is None else threshold)
-        dense = self.dense(images)  # with BatchNorm or dropout: inside `eval_mode.evaluating(self)`
+        dense = self.dense(images)  # with BatchNorm or dropout: inside `eval_mode.in_eval_mode(self)`
         found = []
         for score, box in zip(dense.logit.sigmoid(), dense.box, strict=True):
             place, label = (score > least).nonzero(as_tuple=True)

@@ -56,15 +56,15 @@ def episodes_of(
     """
     references = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
     loaded = [scenario for reference in references for scenario in load_scenarios(reference)]
-    graphs = {town: _town(town) for town in sorted({member.town for member in loaded})}
-    return [_built(member, graphs[member.town], seed) for member in loaded], graphs
+    graphs = {town: _cached_town(town) for town in sorted({member.town for member in loaded})}
+    return [_cached_episode(member, graphs[member.town], seed) for member in loaded], graphs
 
 
 MOST_EPISODES = 5000  # kept in a process
 _episodes: dict[str, Episode] = {}
 
 
-def _built(scenario: Scenario, graph: LaneGraph, seed: int) -> Episode:
+def _cached_episode(scenario: Scenario, graph: LaneGraph, seed: int) -> Episode:
     """Return the episode of a scenario, built once per process."""
     key = digest("episode", safeio.dump_json(asdict(scenario)), seed, id(graph))
     if key not in _episodes:
@@ -75,7 +75,7 @@ def _built(scenario: Scenario, graph: LaneGraph, seed: int) -> Episode:
 
 
 @lru_cache(maxsize=16)
-def _town(name: str) -> LaneGraph:
+def _cached_town(name: str) -> LaneGraph:
     return load_town(name)
 
 

@@ -51,17 +51,17 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_reference_has_a_name_arguments_and_a_label() -> None:
-    found = Reference.of("mine:Mine?checkpoint=runs/a.pt&reach=20&gain=1e-3&loud=true@first")
+    found = Reference.parse("mine:Mine?checkpoint=runs/a.pt&reach=20&gain=1e-3&loud=true@first")
     assert found.name == "mine:Mine"
     assert found.options == {"checkpoint": "runs/a.pt", "reach": 20, "gain": 1e-3, "loud": True}
     assert found.label == "first"
-    assert Reference.of("ppo:/home/a@b/x.safetensors").name == "ppo:/home/a@b/x.safetensors"
+    assert Reference.parse("ppo:/home/a@b/x.safetensors").name == "ppo:/home/a@b/x.safetensors"
     assert label_of("blind") == "blind"
     assert split_weights("fcos3d@a=file=1.pth") == ("fcos3d@a", "file=1.pth")
     assert split_weights("mine:make?checkpoint=a.pt") == ("mine:make?checkpoint=a.pt", "")
     for wrong in ("mine:Mine?checkpoint", "mine:Mine?a=1&a=2", "mine:Mine@", "mine:Mine?1=2"):
         with pytest.raises(ConfigError, match="expected"):
-            Reference.of(wrong)
+            Reference.parse(wrong)
 
 
 def test_arguments_make_another_system_and_the_content_of_their_files_counts(mine: Path) -> None:

@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from ssad.core.checkpoints import (
     WeightsCard,
-    fit_state,
+    copy_matching_weights,
+    copy_state,
     hash_state,
     load_card,
     load_weights,
     read_card,
     save_weights,
-    start_from,
 )
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import MIB
@@ -377,7 +377,7 @@ def test_what_is_saved_is_read_back(half: bool, shard_mb: float, tmp_path: Path)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first
     other = toy(width=8)
     nn.init.zeros_(other.head.weight)
-    fit_state(other, found, "here")
+    copy_state(other, found, "here")
     assert torch.equal(other.head.weight, state["head.weight"].to(found["head.weight"].dtype).float())
 
 
@@ -480,7 +480,7 @@ def refused(state: dict[str, Tensor], module: nn.Module | None = None) -> str:
     module = toy() if module is None else module
     before = {name: value.clone() for name, value in module.state_dict().items()}
     with pytest.raises(FormatError) as caught:
-        fit_state(module, state, "w.pth")
+        copy_state(module, state, "w.pth")
     assert same(dict(module.state_dict()), before)
     return one_line(caught.value)
 
@@ -509,27 +509,30 @@ def test_layers_of_another_shape_or_name_start_fresh() -> None:
     state, module = dict(toy().state_dict()), Toy(classes=80)
     fresh = dict(module.head.state_dict(prefix="head.", keep_vars=False))
     wanted = {k: fresh[k].clone() if k in fresh else v for k, v in state.items()}
-    assert start_from(module, state | {"other.weight": torch.zeros(2)}, "w.pth") == ["head.weight", "head.bias"]
+    assert copy_matching_weights(module, state | {"other.weight": torch.zeros(2)}, "w.pth") == [
+        "head.weight",
+        "head.bias",
+    ]
     assert same(dict(module.state_dict()), wanted)
-    assert start_from(toy(), state, "w.pth") == []
+    assert copy_matching_weights(toy(), state, "w.pth") == []
     few = {k: v for k, v in state.items() if "head" in k}
     with pytest.raises(FormatError, match="these are not the weights of"):
-        start_from(Toy(), few, "w.pth")
+        copy_matching_weights(Toy(), few, "w.pth")
     with pytest.raises(FormatError, match="NaN or infinite"):
-        start_from(Toy(), state | {"head.bias": torch.full_like(state["head.bias"], torch.nan)}, "w.pth")
+        copy_matching_weights(Toy(), state | {"head.bias": torch.full_like(state["head.bias"], torch.nan)}, "w.pth")
 
 
 def test_counters_of_steps_may_be_missing() -> None:
     state = {k: v for k, v in toy().state_dict().items() if "num_batches" not in k}
     module = Toy()
-    fit_state(module, state, "w.pth")
+    copy_state(module, state, "w.pth")
     assert same({k: v for k, v in module.state_dict().items() if k in state}, state)
 
 
 def test_modes_and_gradients_stay() -> None:
     module = toy().requires_grad_(False).double()
     module.body.eval()
-    fit_state(module, toy().half().state_dict(), "w.pth")
+    copy_state(module, toy().half().state_dict(), "w.pth")
     assert not any(p.requires_grad for p in module.parameters())
     assert all(v.dtype is torch.float64 for v in module.parameters())
     assert module.training

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ssad.core.columns import concatenate
-from ssad.core.detections import Detections, Solids, together
+from ssad.core.detections import Detections, Solids, transform_together
 from ssad.core.errors import ConfigError
 
 
@@ -58,12 +58,12 @@ def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:
         return 2 * value
 
     alike = [torch.rand(n, 3) for n in (2, 0, 5)]
-    for before, after in zip(alike, together(alike, twice), strict=True):
+    for before, after in zip(alike, transform_together(alike, twice), strict=True):
         assert (after == 2 * before).all()
     assert calls == [(7, 3)]
     for mixed in ([torch.rand(2, 3), torch.rand(2, 4)], [torch.rand(2), torch.arange(2)], [torch.tensor(1.0)]):
         calls.clear()
-        for before, after in zip(mixed, together(mixed, twice), strict=True):
+        for before, after in zip(mixed, transform_together(mixed, twice), strict=True):
             assert (after == 2 * before).all()
         assert len(calls) == len(mixed)
 

@@ -13,7 +13,7 @@ import pytest
 
 from ssad.core import images
 from ssad.core.errors import ConfigError, FormatError, StoreError
-from ssad.core.images import captioned, decode_image, encode_jpeg, read_image, save_picture
+from ssad.core.images import add_caption, decode_image, encode_jpeg, read_image, save_picture
 
 
 def picture() -> Any:
@@ -135,14 +135,14 @@ def test_a_higher_quality_is_nearer_and_444_keeps_colours_apart() -> None:
 
 def test_a_caption_stands_under_the_picture_and_fits() -> None:
     image = np.full((50, 100, 3), (10, 200, 30), np.uint8)
-    bare = captioned(image, "", 300)
+    bare = add_caption(image, "", 300)
     assert bare.shape == (150 + 26 + 2, 300 + 4, 3)
     assert (bare[2:152, 2:302] == (10, 200, 30)).all(), "the picture, three times as large"
     assert (bare[:2] == 255).all()
     assert (bare[:, :2] == 255).all()
     assert (bare[:, -2:] == 255).all()
     assert (bare[152:] == 255).all(), "nothing is written"
-    short, long = captioned(image, "fog 3", 300), captioned(image, "a word and another " * 3, 300)
+    short, long = add_caption(image, "fog 3", 300), add_caption(image, "a word and another " * 3, 300)
     for written in (short, long):
         dark = (written < 128).all(-1)
         assert dark[152:].sum() > 40

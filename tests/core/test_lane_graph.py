@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import MapError
-from ssad.core.lane_graph import LaneGraph, Marking, equal, load_graph, save_graph
+from ssad.core.lane_graph import LaneGraph, Marking, are_equal, load_graph, save_graph
 from ssad.core.types import LaneType
 from ssad.world.roads import load_town
 from tests.world.worlds import straight_graph
@@ -28,7 +28,7 @@ def test_a_place_on_a_lane_by_hand() -> None:
     widths = graph.width.copy()
     widths[:3] = (3.0, 4.0, 6.0)
     graph = LaneGraph(**(parts(graph) | {"width": widths}))
-    assert graph.lanes == 3
+    assert graph.lane_count == 3
     assert graph.length.tolist() == [100.0] * 3
     assert graph.at(0, 0.0) == (0.0, 0.0, 0.0, 3.0)
     assert graph.at(0, 0.5) == pytest.approx((0.5, 0.0, 0.0, 3.25))
@@ -44,7 +44,7 @@ def test_a_place_on_a_lane_by_hand() -> None:
 @pytest.mark.parametrize("name", ["Ringmere", "Twinford"])
 def test_many_places_are_those_of_one_by_one_to_the_bit(name: str) -> None:
     graph, draws = load_town(name), np.random.default_rng(0)
-    for lane in range(0, graph.lanes, 3):
+    for lane in range(0, graph.lane_count, 3):
         points = graph.s[graph.points(lane)].astype(np.float64)
         s = np.concatenate([draws.uniform(-1.0, float(graph.length[lane]) + 1.0, 20), points])
         found = graph.along(lane, s)
@@ -63,13 +63,13 @@ def test_headings_turn_the_short_way() -> None:
 
 def test_lanes_of_one_road_and_one_sign_run_the_same_way() -> None:
     graph = LaneGraph(**(parts(straight_graph()) | {"lane_id": [-1, 1, -2]}))
-    assert graph.same_direction(0, 2)
-    assert not graph.same_direction(0, 1)
-    assert not graph.same_direction(1, 2)
+    assert graph.is_same_direction(0, 2)
+    assert not graph.is_same_direction(0, 1)
+    assert not graph.is_same_direction(1, 2)
     apart = LaneGraph(**(parts(graph) | {"road": [0, 0, 5]}))
-    assert not apart.same_direction(0, 2)
+    assert not apart.is_same_direction(0, 2)
     middle = LaneGraph(**(parts(graph) | {"lane_id": [0, 0, -2]}))
-    assert not middle.same_direction(0, 1), "the centre lane has no direction"
+    assert not middle.is_same_direction(0, 1), "the centre lane has no direction"
 
 
 def test_links_are_known_from_both_ends() -> None:
@@ -108,7 +108,7 @@ def test_file_round_trip_is_exact_and_deterministic(tmp_path: Path) -> None:
     save_graph(graph, tmp_path / "a.npz")
     again = load_graph(tmp_path / "a.npz")
     save_graph(again, tmp_path / "b.npz")
-    assert equal(graph, again)
+    assert are_equal(graph, again)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
@@ -247,6 +247,6 @@ def test_other_files_are_refused_by_what_is_wrong(changes: dict[str, Any], messa
 
 def test_a_graph_equals_only_one_of_the_same_name_and_numbers() -> None:
     graph = straight_graph()
-    assert equal(graph, straight_graph())
-    assert not equal(graph, LaneGraph(**(parts(graph) | {"name": "Other"})))
-    assert not equal(graph, LaneGraph(**(parts(graph) | {"speed_limit": [30.0, 30.0, 29.0]})))
+    assert are_equal(graph, straight_graph())
+    assert not are_equal(graph, LaneGraph(**(parts(graph) | {"name": "Other"})))
+    assert not are_equal(graph, LaneGraph(**(parts(graph) | {"speed_limit": [30.0, 30.0, 29.0]})))

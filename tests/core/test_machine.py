@@ -19,9 +19,9 @@ from ssad.core.machine import (
     cuda_driver,
     default_workers,
     gpu_workers,
-    keep_memory,
     pick_device,
-    quiet_warp,
+    retain_freed_memory,
+    start_warp_quietly,
     versions,
     visible_gpus,
 )
@@ -53,9 +53,9 @@ class FakeWarp:
 def warp(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeWarp]:
     fake = FakeWarp()
     monkeypatch.setitem(sys.modules, "warp", fake)
-    quiet_warp.cache_clear()  # Warp is started once a process; here another test may have started the real one
+    start_warp_quietly.cache_clear()  # Warp is started once a process; here another test may have started the real one
     yield fake
-    quiet_warp.cache_clear()
+    start_warp_quietly.cache_clear()
 
 
 def has_driver(monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
@@ -80,7 +80,7 @@ def test_without_a_driver_warp_starts_without_a_word(
 ) -> None:
     has_driver(monkeypatch, False)
     before = open_files()
-    quiet_warp()
+    start_warp_quietly()
     assert warp.started == 1
     assert open_files() == before, "nothing is left open"
     os.write(2, b"afterwards\n")
@@ -91,7 +91,7 @@ def test_with_a_driver_what_warp_says_is_shown(
     warp: FakeWarp, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     has_driver(monkeypatch, True)
-    quiet_warp()
+    start_warp_quietly()
     assert warp.started == 1
     assert capfd.readouterr().err == "no driver\n"
 
@@ -172,7 +172,7 @@ def test_gpus_are_shared_by_as_many_as_their_memory_takes(
 HELD = """
 import ctypes
 import numpy as np
-from ssad.core.machine import keep_memory
+from ssad.core.machine import retain_freed_memory
 
 class Mallinfo(ctypes.Structure):  # struct mallinfo2 of <malloc.h>
     _fields_ = [(name, ctypes.c_size_t) for name in (
@@ -190,7 +190,7 @@ def hold():
 
 
 hold()
-keep_memory()
+retain_freed_memory()
 hold()
 """
 
@@ -208,4 +208,4 @@ def test_memory_is_kept_for_the_next_tensor() -> None:
 def test_other_libraries_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
     monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: pytest.fail("there is no glibc to be told"))
-    keep_memory()
+    retain_freed_memory()

@@ -218,9 +218,9 @@ def test_unwritable_places_are_store_errors(tmp_path: Path) -> None:
 
 def test_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SSAD_HOME", "/somewhere")
-    assert safeio.home() == Path("/somewhere")
+    assert safeio.home_folder() == Path("/somewhere")
     monkeypatch.delenv("SSAD_HOME")
-    assert safeio.home() == Path.home() / ".local/share/ssad"
+    assert safeio.home_folder() == Path.home() / ".local/share/ssad"
 
 
 def test_limits(tmp_path: Path) -> None:
@@ -384,7 +384,7 @@ def test_plain_data() -> None:
         "e": None,
         "f": True,
     }
-    assert safeio.plain(given) == {
+    assert safeio.to_plain_json(given) == {
         "a": [1, [0.5, None]],
         "3": {"b": None},
         "c": "text",
@@ -392,7 +392,7 @@ def test_plain_data() -> None:
         "e": None,
         "f": True,
     }
-    assert type(safeio.plain(np.int64(4))) is int
+    assert type(safeio.to_plain_json(np.int64(4))) is int
 
 
 @pytest.mark.parametrize("write", [safeio.make_folder, lambda folder: safeio.write_atomic(folder / "a.png", b"x")])

@@ -6,7 +6,7 @@ import numpy as np
 
 from ssad.core.driving import Belief
 from ssad.core.types import AgentKind
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 
 
 def test_objects_in_the_shadow_of_a_bus_are_hidden() -> None:
@@ -29,12 +29,12 @@ def test_objects_in_the_shadow_of_a_bus_are_hidden() -> None:
         (101.0, 0.0),
         (0.0, 101.0),
     ]
-    assert in_sight(eye, rows(*places)).tolist() == [[True, False, False, True, True, False, False, False]]
+    assert is_visible(eye, rows(*places)).tolist() == [[True, False, False, True, True, False, False, False]]
     # a corner is enough: a walker whose middle lies in the shadow, 0.2 m from its edge
-    assert in_sight(eye, rows((30.0, edge - 0.2))).tolist() == [[True, True]]
+    assert is_visible(eye, rows((30.0, edge - 0.2))).tolist() == [[True, True]]
     people = rows((30.0, 0.0))
     hedge = replace(people, kind=np.full((1, 2), AgentKind.WALKER, np.int32))
-    assert in_sight(eye, hedge).all()  # people hide nobody
+    assert is_visible(eye, hedge).all()  # people hide nobody
     unused = replace(people, kind=np.array([[AgentKind.NONE, AgentKind.WALKER]], np.int32))
-    assert in_sight(eye, unused).tolist() == [[False, True]]
-    assert in_sight(np.array([[20.0, 0.5]], np.float32), people).all()  # who looks from inside sees out
+    assert is_visible(eye, unused).tolist() == [[False, True]]
+    assert is_visible(np.array([[20.0, 0.5]], np.float32), people).all()  # who looks from inside sees out

@@ -56,7 +56,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert found.classes == CLASSES
     first, second = found.images
     assert first.file == page.parent / "a.jpg", "no folder `images` beside the page's"
-    assert (first.width, first.height, dict(first.about)) == (64, 48, {"town": "Twinford"})
+    assert (first.width, first.height, dict(first.metadata)) == (64, 48, {"town": "Twinford"})
     assert np.array_equal(first.box, [[1, 2, 11, 22], [5, 5, 7, 9]])
     assert first.label.tolist() == [0, 1]
     assert first.crowd.tolist() == [False, True]

@@ -16,7 +16,7 @@ from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import detect_scene, match_boxes, score_2d
 from ssad.metrics.detection_boxes import TP_METRICS
-from ssad.training.batches import PictureSet
+from ssad.training.batches import ImageSet
 from ssad.training.data import nuscenes_items
 
 
@@ -67,7 +67,7 @@ def test_perfect_cameras_score_one(recorded: Path) -> None:
 
 def test_2d_truth_scores_one_and_noise_does_not(recorded: Path) -> None:
     truths = tuple(item.truth for item in nuscenes_items(recorded, None, "all"))
-    bank = PictureSet(torch.zeros(len(truths), 90, 160, 3, dtype=torch.uint8), truths)
+    bank = ImageSet(torch.zeros(len(truths), 90, 160, 3, dtype=torch.uint8), truths)
     perfect = Oracle(iter(truths))
     perfect.classes = tuple(str(k) for k in range(10))  # type: ignore[assignment]
     assert score_2d(perfect, bank)["AP50"] == pytest.approx(1.0)  # type: ignore[arg-type]
@@ -81,7 +81,7 @@ def test_2d_classes_are_matched_by_name() -> None:
     """The truth has a class in front that the detector does not know: it is left out, the others keep their names."""
     box = torch.tensor([[10.0, 10.0, 40.0, 40.0], [60.0, 20.0, 90.0, 50.0], [100.0, 5.0, 140.0, 60.0]])
     truth = (Truth(torch.tensor([0, 1, 2]), box),)
-    bank = PictureSet(torch.zeros(1, 90, 160, 3, dtype=torch.uint8), truth)
+    bank = ImageSet(torch.zeros(1, 90, 160, 3, dtype=torch.uint8), truth)
 
     def scored(classes: tuple[str, ...] | None) -> dict[str, float]:
         oracle = Oracle(iter([Truth(torch.tensor([0, 1]), box[1:])]))

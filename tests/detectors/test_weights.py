@@ -18,9 +18,9 @@ from ssad.datasets.coco import CocoSet, read_coco
 from ssad.detectors import SHIPPED, make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
 from ssad.recorders.nuscenes import Recording, record_nuscenes
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
-from ssad.training.batches import PictureSet, fill
+from ssad.training.batches import ImageSet, load_images
 from ssad.training.detector import coco_items, coco_truth
 
 NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
@@ -30,17 +30,19 @@ SCENES = ["scene-larkhill-000"]
 
 
 @pytest.fixture(scope="session")
-def clips(shared: Shared) -> tuple[CocoSet, PictureSet]:
+def clips(shared: Shared) -> tuple[CocoSet, ImageSet]:
     """Four pictures from 20 m behind, in a held-out town and with a seed that no training had."""
 
     def make(out: Path) -> None:
         with two_phases():
-            record_clips(TargetRecording(out, images=(("Larkhill", 4),), held_out=("Larkhill",), seed=77), workers=0)
+            record_target_images(
+                TargetRecording(out, images=(("Larkhill", 4),), held_out=("Larkhill",), seed=77), workers=0
+            )
 
     out = shared("shipped-clips", make)
     data = read_coco(out / "annotations" / "test.json")
-    bank = fill(coco_items(out, "test")[1], threads=1)
-    return data, PictureSet(bank.pictures, tuple(coco_truth(data, target=True)))
+    bank = load_images(coco_items(out, "test")[1], threads=1)
+    return data, ImageSet(bank.pictures, tuple(coco_truth(data, target=True)))
 
 
 def test_some_are_shipped() -> None:
@@ -59,7 +61,7 @@ def test_cards_say_where_they_are_from(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", others_slow(TWO, ["yolov5n"]))
-def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, PictureSet]) -> None:
+def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, ImageSet]) -> None:
     data, bank = clips
     detector = make_detector(name)
     assert set(detector.classes) <= set(data.classes)
@@ -68,7 +70,7 @@ def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TWO)
-def test_fresh_weights_do_not_find_it(name: str, clips: tuple[CocoSet, PictureSet]) -> None:
+def test_fresh_weights_do_not_find_it(name: str, clips: tuple[CocoSet, ImageSet]) -> None:
     data, bank = clips
     fresh = make_detector(name, weights="random", classes=data.classes)
     assert score_2d(fresh, bank)["AP50_car"] < 0.1
@@ -124,7 +126,7 @@ def test_other_weights_under_a_shipped_card_are_refused(tmp_path: Path, monkeypa
         make_detector("yolov5n")
 
 
-def test_each_picture_has_one_target(clips: tuple[CocoSet, PictureSet]) -> None:
+def test_each_picture_has_one_target(clips: tuple[CocoSet, ImageSet]) -> None:
     data, bank = clips
     assert len(bank) == 4
     for image in data.images:

@@ -89,7 +89,7 @@ def test_the_truth_handed_in_fills_rows_with_the_truth() -> None:
     world.truth()  # looks anew
     used = truth.kind > 0
     assert used.sum() > 10
-    assert (truth.stood[used] > 0.0).any()
+    assert (truth.standing_time[used] > 0.0).any()
     for name in ("kind", "pose", "speed", "half", "forecast", "span", "way", "signal", "waited", "gives_way"):
         rows = world.array(f"seen.{name}")
         believed = rows[:, world.agents : 2 * world.agents]
@@ -257,7 +257,7 @@ def test_a_believed_signal_holds_for_the_ego_alone() -> None:
 
 
 def bare(truth: Belief) -> Belief:
-    return replace(truth, forecast=None, way=None, line_signal=None, stood=None, gives_way=None)
+    return replace(truth, forecast=None, way=None, line_signal=None, standing_time=None, gives_way=None)
 
 
 def test_what_is_left_open_is_made_up_from_the_lanes() -> None:
@@ -351,7 +351,9 @@ def test_made_up_ways_are_those_of_the_routes_before_a_junction() -> None:
 def test_lanes_are_found_under_the_middle_of_a_lane() -> None:
     graph = load_town("Twinford")
     lanes = Lanes(graph)
-    pick = [k for k in range(graph.lanes) if graph.kind[k] == 1 and graph.junction[k] < 0 and graph.length[k] > 20][:60]
+    pick = [
+        k for k in range(graph.lane_count) if graph.kind[k] == 1 and graph.junction[k] < 0 and graph.length[k] > 20
+    ][:60]
     places = np.array([graph.at(k, float(graph.length[k]) / 2)[:3] for k in pick], np.float64)
     lane, s, left = lanes.match(places)
     assert lane.tolist() == pick

@@ -14,7 +14,7 @@ from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
 from ssad.core.types import Actor, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
-from ssad.drivers.leaderboard import Leaderboard, RoadOption, _global_plan_of, geolocation
+from ssad.drivers.leaderboard import Leaderboard, RoadOption, _global_plan, geolocation
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.simulators.closed_loop import onboard_sensors
 from ssad.world.roads import load_town
@@ -173,7 +173,7 @@ def test_what_an_agent_is_told(tmp_path: Path) -> None:
     assert eye.to_ego[:3, 3].tolist() == [1.0, -0.5, 2.0]
     assert eye.intrinsic[0, 0] == pytest.approx(32.0)
     episode = build_episode(turn, load_town(turn.town), seed=0)
-    told = {int(option) for _, option in _global_plan_of(episode.agents[0].route, load_town(turn.town))[1]}
+    told = {int(option) for _, option in _global_plan(episode.agents[0].route, load_town(turn.town))[1]}
     assert told == {int(RoadOption.LEFT), int(RoadOption.LANEFOLLOW)}
 
 

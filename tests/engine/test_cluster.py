@@ -59,7 +59,7 @@ class FakeRay:
         self.options = options
 
         def decorate(function: Any) -> SimpleNamespace:
-            assert function is cluster._on_node
+            assert function is cluster._run_on_node
             return SimpleNamespace(remote=self.submitted)
 
         return decorate
@@ -251,11 +251,11 @@ def test_a_ray_worker_keeps_its_child_process_for_tasks_of_one_start(monkeypatch
     monkeypatch.setattr(cluster, "_BACKENDS", {})
     start = (print, "first")
     for number in (1, 2):
-        status, value, reason, error, seconds = cluster._on_node((abs, number, 7.0), start)
+        status, value, reason, error, seconds = cluster._run_on_node((abs, number, 7.0), start)
         assert (status, value, reason, str(error), seconds) == ("failed", number, "why", "error", 0.5)
     assert [(one.start, one.closed) for one in made] == [(start, False)]
     assert [(task.function, task.argument, task.timeout_s) for task in made[0].tasks] == [(abs, 1, 7.0), (abs, 2, 7.0)]
-    cluster._on_node((abs, 3, 7.0), None)
+    cluster._run_on_node((abs, 3, 7.0), None)
     assert [(one.start, one.closed) for one in made] == [(start, True), (None, False)]
-    cluster._on_node((abs, 4, 7.0), start)
+    cluster._run_on_node((abs, 4, 7.0), start)
     assert [(one.start, one.closed) for one in made] == [(start, True), (None, True), (start, False)]

@@ -18,7 +18,7 @@ from helpers.descriptors import open_files
 
 from ssad.core.errors import ConfigError, SSADError
 from ssad.engine import local
-from ssad.engine.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
+from ssad.engine.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, available_memory
 from ssad.engine.task import Task, TaskOutcome
 
 GIB = 1 << 30
@@ -52,24 +52,24 @@ def test_a_worker_works_and_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch)
     worker = Worker(None, {"SSAD_OTHER": "own"})
     assert not worker.ready, "before it says so"
     assert worker.deadline > time.monotonic() + 60, "it may compile kernels"
-    assert worker.hear() is None
+    assert worker.read_answer() is None
     assert worker.ready
     assert worker.deadline == float("inf"), "it has nothing to do"
     assert os.getsid(worker.process.pid) == worker.process.pid, "Ctrl-C at the terminal does not reach it"
     for name, value in (("SSAD_TEST", "theirs"), ("SSAD_OTHER", "own")):
         task = Task(os.getenv, name, 60.0)
-        assert worker.give(task) is None
+        assert worker.start_task(task) is None
         assert worker.deadline == worker.began + 60.0
-        outcome = worker.hear()
+        outcome = worker.read_answer()
         assert outcome is not None
         assert (outcome.task, outcome.status, outcome.value, outcome.reason) == (task, "ok", value, "")
         assert 0 < outcome.seconds < 60
         assert worker.task is None
     told = dict(line.split(":") for line in Path(f"/proc/{worker.process.pid}/status").read_text().splitlines()[:40])
-    assert worker.memory() == pytest.approx(int(told["VmRSS"].split()[0]) * 1024, rel=0.1)
-    worker.end()
+    assert worker.resident_bytes() == pytest.approx(int(told["VmRSS"].split()[0]) * 1024, rel=0.1)
+    worker.kill()
     assert worker.process.returncode == -signal.SIGKILL
-    assert worker.memory() == 0
+    assert worker.resident_bytes() == 0
     assert open_files() == before
 
 
@@ -87,45 +87,45 @@ def test_a_worker_works_and_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch)
 def test_how_a_process_ended(runs: Callable[[str], Worker], script: str, ended: str) -> None:
     worker = runs(script)
     with pytest.raises(SSADError) as caught:
-        worker.hear()
+        worker.read_answer()
     assert str(caught.value) == f"a worker process cannot start: the process ended {ended}"
-    worker.end()
+    worker.kill()
 
 
 def test_last_words_are_short(runs: Callable[[str], Worker]) -> None:
     text = "".join(f"{number:05d}" for number in range(1000))
     worker = runs(f"printf '{text}'; exit 1")
-    assert worker.how_it_ended() == f"the process ended (exit code 1): {text[-4096:][:300]}"
-    worker.end()
+    assert worker.describe_exit() == f"the process ended (exit code 1): {text[-4096:][:300]}"
+    worker.kill()
 
 
 def test_a_worker_that_takes_too_long(runs: Callable[[str], Worker], clock: Clock) -> None:
     worker = runs("echo compiling >&2; sleep 60")
     assert worker.deadline == 5000.0 + 600.0
-    while not worker._last_words():
+    while not worker._last_output_line():
         time.sleep(0.001)
     with pytest.raises(SSADError, match="a worker process did not start within 600 s: compiling"):
-        worker.overdue()
+        worker.time_out()
     worker.ready = True
     clock.now += 100.0
     task = Task(abs, -1, 2.5)
-    assert worker.give(task) is None
+    assert worker.start_task(task) is None
     assert worker.deadline == 5102.5
     clock.now += 3.0
-    assert worker.overdue() == TaskOutcome(task, "timeout", None, "took longer than 2.5 s", None, 3.0)
-    worker.end()
+    assert worker.time_out() == TaskOutcome(task, "timeout", None, "took longer than 2.5 s", None, 3.0)
+    worker.kill()
 
 
 def test_a_worker_that_dies_at_work(runs: Callable[[str], Worker]) -> None:
     worker = runs("sleep 0; exit 7")
     worker.ready = True
-    assert worker.hear() is None, "it had nothing to do"
+    assert worker.read_answer() is None, "it had nothing to do"
     task = Task(abs, -1)
-    assert worker.give(task) is None, "that it is dead is heard"
-    outcome = worker.hear()
+    assert worker.start_task(task) is None, "that it is dead is heard"
+    outcome = worker.read_answer()
     assert outcome is not None
     assert (outcome.status, outcome.reason) == ("crashed", "the process ended (exit code 7)")
-    worker.end()
+    worker.kill()
 
 
 @pytest.mark.parametrize(
@@ -143,14 +143,14 @@ def test_answers_are_outcomes(clock: Clock, answer: tuple[str, Any], status: str
     task = worker.task
     theirs.send(answer)
     clock.now += 2.0
-    outcome = worker.hear()
+    outcome = worker.read_answer()
     assert outcome is not None
     assert (outcome.task, outcome.status, outcome.value, outcome.reason) == (task, status, value, reason)
     assert outcome.seconds == 2.0
     assert isinstance(outcome.error, SSADError) == isinstance(answer[1], SSADError)
     theirs.send(("fatal", "no kernels"))
     with pytest.raises(SSADError, match="no kernels"):
-        worker.hear()
+        worker.read_answer()
     worker.answers.close()
     theirs.close()
 
@@ -175,7 +175,7 @@ class FakeWorker:
         self.cannot_send = False
         self.made.append(self)
 
-    def give(self, task: Task) -> TaskOutcome | None:
+    def start_task(self, task: Task) -> TaskOutcome | None:
         assert self.ready
         assert self.task is None
         self.task = task
@@ -184,7 +184,7 @@ class FakeWorker:
     def answer(self, what: str) -> None:
         self.theirs.send(what)
 
-    def hear(self) -> TaskOutcome | None:
+    def read_answer(self) -> TaskOutcome | None:
         answer = self.answers.recv()
         if answer == "ready":
             self.ready = True
@@ -196,13 +196,13 @@ class FakeWorker:
         task, self.task = self.task, None
         return TaskOutcome(task, status, None, reason)
 
-    def overdue(self) -> TaskOutcome:
+    def time_out(self) -> TaskOutcome:
         return self.outcome("timeout")
 
-    def memory(self) -> int:
+    def resident_bytes(self) -> int:
         return self.held
 
-    def end(self) -> None:
+    def kill(self) -> None:
         assert not self.ended
         self.ended = True
         self.answers.close()
@@ -215,7 +215,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[FakeWorker]:
     workers: list[FakeWorker] = []
     monkeypatch.setattr(FakeWorker, "made", workers, raising=False)
     monkeypatch.setattr(local, "Worker", FakeWorker)
-    monkeypatch.setattr(local, "memory_left", lambda: (100 * GIB, 50 * GIB))
+    monkeypatch.setattr(local, "available_memory", lambda: (100 * GIB, 50 * GIB))
     monkeypatch.delenv(WORKER_MEMORY, raising=False)
     return workers
 
@@ -414,7 +414,7 @@ def test_the_largest_worker_ends_before_the_machine_has_no_memory_left(
 ) -> None:
     left = 4 * GIB
     total = 100 * GIB
-    monkeypatch.setattr(local, "memory_left", lambda: (total, left))
+    monkeypatch.setattr(local, "available_memory", lambda: (total, left))
     monkeypatch.setenv(WORKER_MEMORY, str(90 * GIB))
     place = at_work(made, 2 * GIB, 5 * GIB // 2, GIB)
     clock.now += 1.0
@@ -443,7 +443,7 @@ def test_one_that_is_over_its_limit_is_enough(
     made: list[FakeWorker], clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = 0
-    monkeypatch.setattr(local, "memory_left", lambda: (100 * GIB, left))
+    monkeypatch.setattr(local, "available_memory", lambda: (100 * GIB, left))
     place = at_work(made, 2 * GIB, 3 * GIB)
     left = 50 * GIB
     clock.now += 1.0
@@ -483,23 +483,23 @@ MEMINFO = "MemTotal:   1000 kB\nMemFree:  100 kB\nMemAvailable:  600 kB\n"
 
 
 def test_memory_that_cannot_be_told_is_none(machine_files: Callable[..., None]) -> None:
-    assert memory_left() == (0, 0)
+    assert available_memory() == (0, 0)
     for text in ("MemTotal: 1000 kB\n", "MemTotal: many kB\nMemAvailable: 1 kB\n", "nothing\n"):
         machine_files(meminfo=text)
-        assert memory_left() == (0, 0)
+        assert available_memory() == (0, 0)
 
 
 def test_memory_of_the_machine_and_of_the_container(machine_files: Callable[..., None]) -> None:
     machine_files(meminfo=MEMINFO)
-    assert memory_left() == (1000 << 10, 600 << 10)
+    assert available_memory() == (1000 << 10, 600 << 10)
     machine_files(max="max\n")
-    assert memory_left() == (1000 << 10, 600 << 10), "the container has no limit"
+    assert available_memory() == (1000 << 10, 600 << 10), "the container has no limit"
     machine_files(max="500000\n", current="300000\n", stat="anon 5\ninactive_file 100000\n")
-    assert memory_left() == (500000, 300000), "files that are kept in memory for nothing count as free"
+    assert available_memory() == (500000, 300000), "files that are kept in memory for nothing count as free"
     machine_files(max=str(1 << 40), current="300000\n", stat="anon 5\n")
-    assert memory_left() == (1000 << 10, 600 << 10), "no more than the machine has"
+    assert available_memory() == (1000 << 10, 600 << 10), "no more than the machine has"
     machine_files(max="500000\n", current="300000\n", stat="anon 5\n")
-    assert memory_left() == (500000, 200000)
+    assert available_memory() == (500000, 200000)
 
 
 # this very process

@@ -12,7 +12,7 @@ import pytest
 
 from ssad.core.errors import ConfigError, SSADError, StoreError
 from ssad.engine import pool as pools
-from ssad.engine.local import LocalProcesses, memory_left
+from ssad.engine.local import LocalProcesses, available_memory
 from ssad.engine.pool import Pool, open_pool, run_all
 from ssad.engine.task import Task, TaskOutcome
 
@@ -303,7 +303,7 @@ def test_gpus_of_different_memory_are_shared_alike(machine: dict[str, Any], monk
 
 
 def test_memory_is_told() -> None:
-    total, free = memory_left()
+    total, free = available_memory()
     assert 0 < free < total
 
 

@@ -9,7 +9,7 @@ from helpers.clock import Clock, stopped
 from rich.console import Console
 
 from ssad.engine import progress
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def text(console: Console) -> str:
 
 def test_a_line_every_ten_seconds_and_one_at_the_end(clock: Clock) -> None:
     console = plain()
-    with Live("suite", 20, 4, console=console) as live:
+    with LiveProgress("suite", 20, 4, console=console) as live:
         live.tick()
         clock.now += 9.5
         live.tick()
@@ -52,7 +52,7 @@ def test_a_line_every_ten_seconds_and_one_at_the_end(clock: Clock) -> None:
 
 
 def test_time_left_is_told_once_something_was_done_and_until_all_is(clock: Clock) -> None:
-    live = Live("recording", 3, 1, console=plain(), unit="scenes")
+    live = LiveProgress("recording", 3, 1, console=plain(), unit="scenes")
     clock.now += 61.0
     assert live.remaining_time() == "eta --:--", "what an earlier process did tells nothing"
     live.advance(True)
@@ -65,7 +65,7 @@ def test_time_left_is_told_once_something_was_done_and_until_all_is(clock: Clock
 
 def test_counts_can_be_set(clock: Clock) -> None:
     console = plain()
-    live = Live("toolbox", 2, 0, console=console)
+    live = LiveProgress("toolbox", 2, 0, console=console)
     clock.now += 10.0
     live.show(4, 6)
     assert text(console) == "toolbox: 4/6 cells  eta 00:05\n"
@@ -73,7 +73,7 @@ def test_counts_can_be_set(clock: Clock) -> None:
 
 def test_a_terminal_gets_a_bar_and_no_lines(clock: Clock) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=100, _environ={})
-    with Live("suite", 20, 4, console=console) as live:
+    with LiveProgress("suite", 20, 4, console=console) as live:
         assert live.bar is not None
         (task,) = live.bar.tasks
         assert (task.description, task.completed, task.total) == ("suite", 4, 20)

@@ -153,7 +153,7 @@ class Bench:
         self.backend: Scripted
         self.asked: list[tuple[int, dict[str, Any]]] = []
         monkeypatch.setattr(engine, "open_pool", self.open)
-        monkeypatch.setattr(engine, "Live", Bar)
+        monkeypatch.setattr(engine, "LiveProgress", Bar)
         monkeypatch.setattr(engine, "versions", lambda device: {"ssad": "1", "device": device})
         monkeypatch.setattr(Words, "seen", [])
 
@@ -367,14 +367,14 @@ def test_a_system_that_failed_alone_is_left_out_when_a_piece_fails_that_was_at_w
     """The piece of several systems had begun when one of them failed at another piece."""
     monkeypatch.setattr(Words, "shares", lambda word: [word])
     schedule: list[Any] = []
-    original = engine._Schedule.work
+    original = engine._Schedule.run_cells
 
     def work(self: Any, missing: Sequence[Cell]) -> None:
         schedule.append(self)
         self.unshared_systems.add("b")
         original(self, missing)
 
-    monkeypatch.setattr(engine._Schedule, "work", work)
+    monkeypatch.setattr(engine._Schedule, "run_cells", work)
     bench.fate = ends("x for a b", **FAILED)
     records = bench.run("a b", "x")
     assert {record["status"] for record in records.values()} == {"ok"}

@@ -27,7 +27,7 @@ from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.jsonl import read_lines
 from ssad.engine.kind import Resources
 from ssad.engine.local import WORKER_MEMORY, Worker
-from ssad.engine.run import run, slice_of
+from ssad.engine.run import run, select_cells
 from ssad.experiments.runs import read_plan, write_report
 from ssad.experiments.suites import kind_of, load_suite
 
@@ -121,8 +121,8 @@ def test_what_a_kind_imports_costs_no_cell_its_time(tmp_path: Path, monkeypatch:
         "    Path(__file__).with_name('imported').write_text(repr(time.monotonic()))\n"
     )
     given = []
-    give = Worker.give
-    monkeypatch.setattr(Worker, "give", lambda worker, task: given.append(time.monotonic()) or give(worker, task))
+    give = Worker.start_task
+    monkeypatch.setattr(Worker, "start_task", lambda worker, task: given.append(time.monotonic()) or give(worker, task))
     plan = importlib.import_module("late_dice").Late().plan(dice(["a"]))
     (record,) = run(plan, tmp_path / "run", Resources(1, console=Console(file=io.StringIO())))
     assert record["status"] == "ok"
@@ -211,7 +211,7 @@ def test_a_slice_that_is_retried_leaves_what_failed_elsewhere(tmp_path: Path) ->
 
 def test_a_worker_that_cannot_start_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_kind.Dice, "start", _cannot_start)
-    monkeypatch.setattr("ssad.engine.run._start", _cannot_start)
+    monkeypatch.setattr("ssad.engine.run._start_worker", _cannot_start)
     with pytest.raises(SSADError, match="no die here") as caught:
         go(dice(["a"]), tmp_path)
     assert "\n" not in str(caught.value)
@@ -359,4 +359,4 @@ def test_slices_add_up_to_the_run(tmp_path: Path) -> None:
 )
 def test_a_slice_is_named_by_values_with_or_without_commas(only: dict[str, list[Any]], expected: list[str]) -> None:
     plan = own_kind.Dice().plan(dice(["a", "c", "a,b", "7"], systems=["fair", "loaded"]))
-    assert sorted(cell.name for cell in slice_of(plan, only)) == sorted(expected)
+    assert sorted(cell.name for cell in select_cells(plan, only)) == sorted(expected)

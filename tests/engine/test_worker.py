@@ -47,8 +47,8 @@ def do(what: str) -> Any:
 
 def work(process: Worker, what: Any) -> TaskOutcome:
     """How a task ended."""
-    assert process.give(Task(do, what)) is None
-    outcome = process.hear()
+    assert process.start_task(Task(do, what)) is None
+    outcome = process.read_answer()
     assert outcome is not None
     return outcome
 
@@ -57,9 +57,9 @@ def work(process: Worker, what: Any) -> TaskOutcome:
 def process() -> Any:
     """A worker that is ready."""
     one = Worker(None, {})
-    one.hear()
+    one.read_answer()
     yield one
-    one.end()
+    one.kill()
 
 
 @pytest.mark.parametrize(
@@ -111,10 +111,10 @@ def test_what_cannot_be_imported_there_is_told(process: Worker, monkeypatch: pyt
 
 def test_it_begins_with_the_start(tmp_path: Path) -> None:
     one = Worker((begin, tmp_path / "begun"), {})
-    assert one.hear() is None
+    assert one.read_answer() is None
     assert one.ready
     assert (tmp_path / "begun").exists()
-    one.end()
+    one.kill()
 
 
 @pytest.mark.parametrize(
@@ -123,26 +123,26 @@ def test_it_begins_with_the_start(tmp_path: Path) -> None:
 def test_a_start_that_fails_is_told_and_ends_it(what: str, message: str) -> None:
     one = Worker((do, what), {})
     with pytest.raises(Exception, match=message):
-        one.hear()
+        one.read_answer()
     assert one.process.wait() == 0
-    one.end()
+    one.kill()
 
 
 def test_it_ends_with_its_input() -> None:
     one = Worker(None, {})
-    one.hear()
+    one.read_answer()
     one._requests.close()
     assert one.process.wait() == 0
-    one.end()
+    one.kill()
 
 
 def test_it_ends_with_its_input_even_at_work() -> None:
     one = Worker(None, {})
-    one.hear()
-    assert one.give(Task(signal.sigwait, [signal.SIGUSR1])) is None
+    one.read_answer()
+    assert one.start_task(Task(signal.sigwait, [signal.SIGUSR1])) is None
     one._requests.close()
     assert one.process.wait() == 0
-    one.end()
+    one.kill()
 
 
 def test_the_kernel_is_asked_to_end_it_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:

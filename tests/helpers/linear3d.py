@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.protocols import Detector
-from ssad.training.batches import fill
+from ssad.training.batches import load_images
 from ssad.training.data import nuscenes_items
 
 CLEAN = 6.0  # logit of every object in a clean picture
@@ -32,7 +32,7 @@ class Linear(nn.Module):
 
     def __init__(self, root: Path, seed: int = 0) -> None:
         super().__init__()
-        self.known = fill(list(nuscenes_items(root, None, "all")), threads=1)
+        self.known = load_images(list(nuscenes_items(root, None, "all")), threads=1)
         pictures = cast(Tensor, self.known.pictures)
         self.register_buffer("small", pictures[:, ::4, ::4].float().permute(0, 3, 1, 2) / 255, persistent=False)
         self.register_buffer("clean", pictures.permute(0, 3, 1, 2).float() / 255, persistent=False)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssad.core.detections import Detections, Solids, Truth
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
-from ssad.training.batches import fill
+from ssad.training.batches import load_images
 from ssad.training.data import nuscenes_items
 
 
@@ -24,7 +24,7 @@ class Oracle:
 
     def __init__(self, root: Path) -> None:
         items = list(nuscenes_items(root, None, "all"))
-        self.bank = fill(items, threads=1)
+        self.bank = load_images(items, threads=1)
         self.small = self.bank.pictures[:, ::4, ::4].float() / 255
 
     def predict(

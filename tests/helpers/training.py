@@ -13,8 +13,8 @@ from torch import distributed
 from ssad.core.detections import Truth
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolov3 import YOLOV3_TINY
-from ssad.training.batches import PictureSet
-from ssad.training.loop import Share, train
+from ssad.training.batches import ImageSet
+from ssad.training.loop import ProcessRank, train
 from ssad.training.recipe import Recipe
 
 CLASSES = ("car", "person")
@@ -24,7 +24,7 @@ COLOURS = ((230, 30, 30), (30, 30, 230))  # of the classes
 RECIPE = Recipe("yolov3-tiny", 3, 4, 2e-3, warmup=2, zoom=(0.7, 1.4), average=0.9)
 
 
-def bank(count: int = 8, *, seed: int = 0) -> PictureSet:
+def bank(count: int = 8, *, seed: int = 0) -> ImageSet:
     """Grey pictures with one to three coloured squares side by side."""
     rng = np.random.default_rng(seed)
     pictures = np.full((count, *SIZE, 3), 114, np.uint8)
@@ -38,7 +38,7 @@ def bank(count: int = 8, *, seed: int = 0) -> PictureSet:
             picture[y : y + side, x : x + side] = COLOURS[labels[-1]]
             boxes.append([x, y, x + side, y + side])
         truth.append(Truth(torch.tensor(labels), torch.tensor(boxes, dtype=torch.float32)))
-    return PictureSet(torch.from_numpy(pictures), tuple(truth))
+    return ImageSet(torch.from_numpy(pictures), tuple(truth))
 
 
 def fresh() -> Yolo:
@@ -53,12 +53,12 @@ def learn(rank: int, world: int, port: int, out: str) -> None:
     distributed.init_process_group("gloo", rank=rank, world_size=world)
     try:
         whole = bank()
-        mine = PictureSet(whole.pictures[rank::world], whole.truth[rank::world])
+        mine = ImageSet(whole.pictures[rank::world], whole.truth[rank::world])
         detector = fresh()
         recipe = replace(RECIPE, epochs=2)
         # only the first process is out of time after an epoch: all must stop, and go on together
-        train(detector, mine, recipe, out=Path(out), share=Share(rank, world), seconds=1e9 * rank)
-        train(detector, mine, recipe, out=Path(out), share=Share(rank, world))
+        train(detector, mine, recipe, out=Path(out), share=ProcessRank(rank, world), seconds=1e9 * rank)
+        train(detector, mine, recipe, out=Path(out), share=ProcessRank(rank, world))
         torch.save({name: value.detach() for name, value in detector.named_parameters()}, Path(out) / f"{rank}.pt")
     finally:
         distributed.destroy_process_group()

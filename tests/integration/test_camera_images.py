@@ -16,7 +16,7 @@ from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, cl
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera_sheets import SHOWN, class_sheet
 from ssad.rendering.episode_scene import EpisodeScene, agent_poses, body_of
-from ssad.rendering.trace_sheet import above, moments, onboard_sheet, pick_trace
+from ssad.rendering.trace_sheet import make_overhead_camera, moments, onboard_sheet, pick_trace
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
@@ -67,7 +67,7 @@ def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
     town.add_bodies(looks.bodies())
     people = [thing for thing in town.objects(looks, agent_poses(trace)[0], without=0) if thing.tag]
     assert {t.tag for t in people} == {a + 1 for a in range(1, len(trace.models)) if trace.active[0, a]}
-    camera, pose = above(np.eye(4), 40.0, 64, 36)
+    camera, pose = make_overhead_camera(np.eye(4), 40.0, 64, 36)
     assert pose[:3, 2] == pytest.approx([0, 0, -1])
     assert camera.width == 64
     sheet = onboard_sheet(trace, graph, width=160)

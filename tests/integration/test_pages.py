@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import avoidable
-from ssad.recorders.nuscenes import WEATHERS, draw_weather, weather_words
+from ssad.recorders.nuscenes import WEATHERS, describe_weather, draw_weather
 from ssad.recorders.viewpoints import weather_name
 
 ROOT = Path(__file__).parents[2]
@@ -64,7 +64,7 @@ def test_the_light_of_a_recorded_drive_is_read_from_its_words(kind: str) -> None
     read = runpy.run_path(str(ROOT / "benchmarks" / "detector_accuracy.py"))["weather_of"]
     for k in range(20):
         weather = draw_weather(("drive", k), kind)
-        assert read(f"Town, {weather_words(weather)}") == weather_name(weather)
+        assert read(f"Town, {describe_weather(weather)}") == weather_name(weather)
 
 
 def test_every_page_has_a_place_on_the_site_and_its_links_lead_somewhere(tmp_path: Path) -> None:

@@ -175,7 +175,8 @@ CASES: dict[tuple[str, str], Case] = {
     ("digital", "attacks.members.loss"): (
         "loss",
         partial(
-            loss_of, lambda loss: {"attacks": [{"name": "ensemble", "members": ["fgsm", {"name": "pgd", "loss": loss}]}]}
+            loss_of,
+            lambda loss: {"attacks": [{"name": "ensemble", "members": ["fgsm", {"name": "pgd", "loss": loss}]}]},
         ),
     ),
     ("digital", "sweeps.name"): ("attack", row("sweeps", radii=[2])),

@@ -11,6 +11,7 @@ import pytest
 from helpers.command import ssad
 from helpers.template import FOLDER, PROJECT, installed_template
 
+
 @pytest.fixture(autouse=True)
 def installed(tmp_path: Path) -> Iterator[None]:
     """The template, installed."""

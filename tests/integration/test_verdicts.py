@@ -165,14 +165,32 @@ def test_of_many_generators_the_best_are_named_beside_random_search(tmp_path: Pa
     assert "blind survives none of its scenarios unchanged" in said
 
 
+def digital_line(attack: str | None, score: float, *, norm: str = "linf", radius: float = 5.0) -> dict[str, Any]:
+    """A record of kind `digital`, without what only some of its tables need."""
+    checks = dict.fromkeys(("loss_before", "loss_after", "gradient_error", "coupling", "used", "change_px"))
+    return {
+        "detector": "d",
+        "attack": attack,
+        "loss": None,
+        "norm": norm,
+        "radius": radius,
+        "steps": 10 if attack == "pgd" else 0,
+        "options": "",
+        "access": "white-box" if attack == "pgd" else "none",
+        "replicates": {},
+        "metrics": {"mAP": score},
+        **checks,
+    }
+
+
 @pytest.mark.parametrize(("noise", "said"), [(0.4, "what lies between is the attack's"), (0.1, "does no more than")])
 def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: float, said: str) -> None:
     scores = {"": 0.5, "noise": noise, "pgd": 0.2}
-    rows = [{"detector": "d", "attack": name, "metrics": {"mAP": value}} for name, value in scores.items()]
+    rows = [digital_line(name, value) for name, value in scores.items()]
     assert said in told(tmp_path / "all", "digital", rows)
     # noise that nothing survives, two scenes that are easier and a defence do not change what is said of the table
     others = ({"attack": "noise", "row": False}, {"attack": "", "subset": 1}, {"attack": "pgd", "defence": "jpeg"})
-    more = [{"detector": "d", "metrics": {"mAP": 0.0}} | one for one in others]
+    more = [digital_line("", 0.0) | one for one in others]
     assert told(tmp_path / "more", "digital", [*rows, *more]) == told(tmp_path / "all", "digital", rows)
     # before an attack has been run there is nothing to say of noise, and the page says that it is early
     assert told(tmp_path / "some", "digital", rows[:2], planned=3) == "Not finished: 2 of 3 cells have run."
@@ -243,7 +261,7 @@ def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) 
 
 def test_of_rows_of_one_attack_the_strongest_counts_beside_noise_of_its_size(tmp_path: Path) -> None:
     rows = [
-        {"detector": "d", "attack": attack, "loss": None, "norm": norm, "radius": radius, "metrics": {"mAP": score}}
+        digital_line(attack, score, norm=norm, radius=radius)
         for attack, norm, radius, score in (
             (None, None, 0.0, 0.5),
             ("noise", "linf", 5.0, 0.45),

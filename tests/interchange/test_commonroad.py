@@ -19,7 +19,7 @@ from ssad.interchange.commonroad_writer import STILL
 from ssad.interchange.export import export_commonroad
 from ssad.metrics import episode_metrics
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -39,7 +39,7 @@ def built(scenarios: Sequence[Scenario]) -> list[Episode]:
 def returned(scenarios: Sequence[Scenario], folder: Path, system: str) -> list[Scenario]:
     files, _ = export_commonroad(scenarios, folder, system=system)
     found = [read_commonroad(path) for path in files]
-    assert all(one.known and not one.lost for one in found)
+    assert all(one.is_known_town and not one.omissions for one in found)
     return [one.scenario for one in found]
 
 
@@ -49,7 +49,7 @@ def recorded(scenarios: Sequence[Scenario], system: str) -> list[Episode]:
     fixed = [all(agent.controller in STILL for agent in e.agents[1:]) for e in episodes]
     traces = drive(episodes, system)
     return [
-        episode if still else built([frozen(episode, trace)])[0]
+        episode if still else built([freeze_episode(episode, trace)])[0]
         for episode, trace, still in zip(episodes, traces, fixed, strict=True)
     ]
 
@@ -133,14 +133,14 @@ def test_lanelets_give_back_the_lanes(town: str, tmp_path: Path) -> None:
     text = path.read_text()
     path.write_text(text.replace(f"town={town};", "town=Elsewhere;").replace(f"ZAM_{town}-", "ZAM_Elsewhere-"))
     found = read_commonroad(path, town="elsewhere")
-    assert not found.known
+    assert not found.is_known_town
     other = found.graph
     for field, close in (("xy", 1e-3), ("width", 1e-3), ("s", 0.01), ("speed_limit", 1e-3)):
         assert np.abs(getattr(graph, field) - getattr(other, field)).max() < close, field
     assert np.abs(np.angle(np.exp(1j * (graph.yaw - other.yaw)))).max() < 0.01
     for field in ("kind", "left", "right", "offset", "left_marking", "right_marking", "sign_kind", "rule_lane"):
         assert np.array_equal(getattr(graph, field), getattr(other, field)), field
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         assert set(graph.successors(lane).tolist()) == set(other.successors(lane).tolist())
     driving = graph.kind == 1
     assert np.array_equal((graph.junction >= 0)[driving], (other.junction >= 0)[driving])
@@ -227,7 +227,12 @@ def test_a_scenario_of_others_is_driven(tmp_path: Path, monkeypatch: pytest.Monk
     assert done.returncode == 0, done.stderr
     (found,) = read_scenarios(tmp_path / "us.yaml")
     graph = load_town("us")
-    assert (found.name, found.town, graph.lanes, float(graph.speed_limit[0])) == ("USA_Test-1_1_T-1", "us", 2, 25.0)
+    assert (found.name, found.town, graph.lane_count, float(graph.speed_limit[0])) == (
+        "USA_Test-1_1_T-1",
+        "us",
+        2,
+        25.0,
+    )
     truck, car, walker = found.actors
     assert (truck.model, truck.trajectory) == ("truck", ())
     assert (car.model, car.trajectory[-1][:3]) == ("suv", (0.8, 46.4, 0.0))

@@ -67,7 +67,7 @@ def test_files_are_valid_and_collide_where_bodies_do(every: int, tmp_path: Path)
     for path, trace in driven(scenarios, tmp_path):
         assert schema.validate(etree.parse(path)), schema.error_log
         checker = create_collision_checker(opened(path))
-        boxes = criticality.boxes(trace)
+        boxes = criticality.trace_boxes(trace)
         gap = obb_distance(boxes[:, :1], boxes[:, 1:])
         gap = np.where(trace.active[:, 1:], gap, np.inf).min(1)
         for step, (x, y, yaw, length, width) in enumerate(boxes[:, 0].tolist()):
@@ -152,7 +152,7 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
     graph = load_town("ProvingGround")
     lane = next(
         k
-        for k in range(graph.lanes)
+        for k in range(graph.lane_count)
         if graph.kind[k] == 1
         and graph.length[k] > 140.0
         and np.ptp(graph.yaw[graph.points(k)]) < 1e-3
@@ -181,5 +181,5 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
         theirs = measures.TTC(config).compute(other, step, verbose=False)
         assert theirs == pytest.approx(ours[step], abs=0.02), step
         headway = measures.HW(config).compute(other, step, verbose=False)
-        bodies = criticality.boxes(trace)[step]
+        bodies = criticality.trace_boxes(trace)[step]
         assert headway == pytest.approx(float(obb_distance(bodies[0], bodies[1])), abs=0.02)

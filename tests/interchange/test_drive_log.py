@@ -21,7 +21,7 @@ from ssad.drivers import make_system
 from ssad.interchange.drive_log import AXLE_TO_MIDDLE, model_of, scenario_of_drive
 from ssad.recorders.nuscenes import Recording, record_nuscenes
 from ssad.scenarios.dynamic import build_episode, read_scenarios
-from ssad.scenarios.dynamic.frozen import thinned
+from ssad.scenarios.dynamic.frozen import drop_collinear_rows
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -59,9 +59,9 @@ def test_a_logged_drive_replays_within_a_centimetre(place: str, logged: Path, fo
     with NuScenes(logged if place == "the town it says" else foreign) as data:
         drive = scenario_of_drive(data, SCENE, town="Logged", map_name=str(home) if place == "a map" else None)
         scene = data.scene(SCENE)
-    assert drive.known == (place == "the town it says")
-    assert drive.graph.name == drive.scenario.town == ("Twinford" if drive.known else "Logged")
-    assert (drive.graph.lanes < 20) == (place == "paths")
+    assert drive.is_known_town == (place == "the town it says")
+    assert drive.graph.name == drive.scenario.town == ("Twinford" if drive.is_known_town else "Logged")
+    assert (drive.graph.lane_count < 20) == (place == "paths")
     episode = build_episode(drive.scenario, drive.graph, seed=0)
     (trace,) = rollout(World([episode], {drive.graph.name: drive.graph}), make_system("autopilot"))
     assert trace.end == "complete"
@@ -188,7 +188,7 @@ def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
     assert actors["adult-1-2"].trajectory == ((3.0, 130.0, 61.0, 0.3), (3.5, 130.0, 61.5, 0.3))
     assert actors["trafficcone-1"].trajectory == ((1.5, 140.0, 53.0, 0.3), (1.6, 140.0, 53.0, 0.3))
     assert actors["trafficcone-1"].model == "cone"
-    assert dict(drive.left_out) == {"animal": 1}
+    assert dict(drive.omissions) == {"animal": 1}
     assert drive.scenario.target_speed == pytest.approx(8.0)
     assert drive.scenario.parameters == {"ego_speed": 8.0}
     first, *_, last = drive.scenario.route
@@ -201,7 +201,7 @@ def test_the_ego_starts_where_and_as_fast_as_in_the_log(tmp_path: Path) -> None:
     cone = ("movable_object.trafficcone", (0.4, 0.4, 0.8), still(240.0, -12.0), [3])
     root = write(tmp_path, [cone], lambda t: (217.0 + 6.0 * t, -4.65), yaw=0.1)
     drive = opened(root, map_name="ProvingGround")
-    assert drive.known
+    assert drive.is_known_town
     ego = build_episode(drive.scenario, drive.graph, seed=0).agents[0]
     assert (ego.pose.x, ego.pose.y, ego.pose.yaw) == pytest.approx((217.0, -4.65, 0.1), abs=0.01)
     assert ego.speed == pytest.approx(6.0)
@@ -213,7 +213,7 @@ def test_the_nearest_are_kept_where_there_are_too_many(tmp_path: Path) -> None:
     drive = opened(write(tmp_path, far[::-1]))
     assert len(drive.scenario.actors) == 62
     assert max(actor.pose.y for actor in drive.scenario.actors) == 121.0
-    assert dict(drive.left_out) == {"too many (a scene has room for 62)": 8}
+    assert dict(drive.omissions) == {"too many (a scene has room for 62)": 8}
 
 
 def test_who_appears_later_may_appear_where_the_ego_began(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_rows_on_a_line_are_left_out_and_no_others() -> None:
     bend = np.maximum(times - 4.0, 0.0)
     rows = np.stack([times, 5.0 * times, bend**2, 3.0 + 0.1 * bend], 1)
     rows[:, 3] = np.angle(np.exp(1j * rows[:, 3]))  # through a heading of 180 degrees
-    kept = np.array(thinned(rows))
+    kept = np.array(drop_collinear_rows(rows))
     assert kept[:2, 0].tolist() == [0.0, 4.0]
     assert len(kept) == 2 + 7
     for k in range(1, 3):

@@ -15,7 +15,7 @@ from ssad.drivers import make_system
 from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1, read_leaderboard
 from ssad.metrics import episode_metrics
 from ssad.scenarios.dynamic import build_episode, import_routes, load_scenarios, read_scenarios
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -28,7 +28,7 @@ def recorded() -> Scenario:
     (scenario,) = load_scenarios("CrossingNegotiation/00")
     episode = build_episode(scenario, load_town(scenario.town), seed=0)
     world = World([episode], {episode.town: load_town(episode.town)})
-    return frozen(episode, rollout(world, make_system("blind"))[0], name="recorded/00")
+    return freeze_episode(episode, rollout(world, make_system("blind"))[0], name="recorded/00")
 
 
 @pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow)])

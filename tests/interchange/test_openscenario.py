@@ -22,7 +22,7 @@ from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario
 from ssad.metrics import episode_metrics
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -112,7 +112,9 @@ def test_generated_scenarios_come_back(tmp_path: Path) -> None:
 def test_trajectories_come_back(every: int, tmp_path: Path) -> None:
     """Natural traffic as it was recorded: also who appears later, and who leaves before the end."""
     natural = built(load_scenarios("natural")[::every])
-    scenarios = [frozen(e, t, name=f"seen/{k}") for k, (e, t) in enumerate(zip(natural, drive(natural), strict=True))]
+    scenarios = [
+        freeze_episode(e, t, name=f"seen/{k}") for k, (e, t) in enumerate(zip(natural, drive(natural), strict=True))
+    ]
     late = Actor("late", "compact", Pose(0.0, 0.0), trajectory=((2.0, 0.0, 0.0, 0.0), (4.0, 10.0, 0.0, 0.0)))
     early = replace(
         late, name="early", trajectory=((-1.0, 0.0, 30.0, 0.0), (3.0, 8.0, 30.0, 0.0)), pose=Pose(0.0, 30.0)
@@ -270,7 +272,7 @@ def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
     assert (actor.pose.x, actor.pose.y) == pytest.approx((237.0, -1.75), abs=0.01)
     assert actor.phases[0] == Phase(9.0, replace(actor.phases[0].when, kind="ego_distance", value=15.0))
     assert found.scenario.limits.max_time == 20.0
-    lost = "\n".join(found.lost)
+    lost = "\n".join(found.omissions)
     assert "EnvironmentAction at the start" in lost
     assert "the body of 'adversary' (4.5 x 2 m) becomes 'suv'" in lost
     passed = replace(found.scenario, limits=replace(found.scenario.limits, contact="count"))
@@ -305,7 +307,7 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
         Phase(9.0, PhaseTrigger("after", 2.0)),
         Phase(0.0, PhaseTrigger("after", 3.5)),
     )
-    assert not any("delay" in line for line in found.lost)
+    assert not any("delay" in line for line in found.omissions)
     (trace,) = drive(built([found.scenario]), "blind")
     gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
     moving, speed = int(np.flatnonzero(trace.speed[:, 1] > 0.0)[0]), trace.speed[:, 1]
@@ -314,11 +316,11 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
 
     path.write_text(text.replace('storyboardElementRef="go"', 'storyboardElementRef="a"'))
     found = read_openscenario(path)
-    assert any("the delay of the trigger of 'stop' after another event" in line for line in found.lost)
+    assert any("the delay of the trigger of 'stop' after another event" in line for line in found.omissions)
     path.write_text(text.replace('state="startTransition"', 'state="completeState"'))
     found = read_openscenario(path)
     assert found.scenario.actors == (actor,)
-    assert any("is counted from where the event before begins" in line for line in found.lost)
+    assert any("is counted from where the event before begins" in line for line in found.omissions)
     timed = re.sub(
         "(?s)<ByEntityCondition>.*?</ByEntityCondition>",
         '<ByValueCondition><SimulationTimeCondition value="1.5" rule="greaterThan"/></ByValueCondition>',

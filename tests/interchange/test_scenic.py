@@ -15,7 +15,7 @@ from helpers.command import ssad
 
 from ssad.core.types import Controller, Episode, EpisodeAgent, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
-from ssad.interchange.scenic_programs import Program, load_program, map_of, sample
+from ssad.interchange.scenic_programs import ScenicProgram, load_program, map_of, sample
 from ssad.scenarios.dynamic import build_episode, read_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
 from ssad.world.roads import load_town
@@ -79,18 +79,18 @@ def written(folder: Path, text: str, name: str = "program.scenic") -> Path:
 
 
 @pytest.fixture(scope="module")
-def braking(tmp_path_factory: pytest.TempPathFactory) -> Program:
+def braking(tmp_path_factory: pytest.TempPathFactory) -> ScenicProgram:
     return load_program(written(tmp_path_factory.mktemp("scenic"), BRAKING, "braking.scenic"), TOWN)
 
 
-def test_a_program_of_the_driving_library_runs_unchanged(braking: Program) -> None:
+def test_a_program_of_the_driving_library_runs_unchanged(braking: ScenicProgram) -> None:
     """The leader drives for 4 s and brakes; the ego, whose behaviour sees it, stops behind."""
     drawn = sample(braking, 3)
     lead, walker = drawn.scenario.actors
     assert (drawn.scenario.town, drawn.scenario.name, walker.trajectory) == (TOWN, "braking/03", ())
     assert (lead.name, lead.model, walker.model) == ("Car-1", "suv", "walker")
-    assert "9 seconds" in drawn.ended or "time" in drawn.ended
-    assert any("4.5 x 2 m object becomes 'suv'" in line for line in drawn.lost)
+    assert "9 seconds" in drawn.end_reason or "time" in drawn.end_reason
+    assert any("4.5 x 2 m object becomes 'suv'" in line for line in drawn.omissions)
     rows = np.array(lead.trajectory)
     driven = np.r_[0.0, np.cumsum(np.hypot(*np.diff(rows[:, 1:3], axis=0).T))]
     at = np.interp((4.0, 6.5, 9.0), rows[:, 0], driven)
@@ -100,7 +100,7 @@ def test_a_program_of_the_driving_library_runs_unchanged(braking: Program) -> No
     assert sample(braking, 4).scenario != drawn.scenario
 
 
-def test_a_sample_is_driven_by_any_system(braking: Program) -> None:
+def test_a_sample_is_driven_by_any_system(braking: ScenicProgram) -> None:
     episode = build_episode(sample(braking, 3).scenario, load_town(TOWN), seed=0)
     world = World([episode, episode], {TOWN: load_town(TOWN)})
     careful, _ = rollout(world, make_system("autopilot"))
@@ -138,7 +138,7 @@ def test_bodies_move_as_the_world_moves_them(tmp_path: Path) -> None:
     assert np.hypot(*(walked[-1] - walked[-5])) < 1e-6
 
 
-def test_a_program_is_a_generator(braking: Program) -> None:
+def test_a_program_is_a_generator(braking: ScenicProgram) -> None:
     scenario = sample(braking, 3, name="base").scenario
     trials = Trials(ego=lambda: make_system("blind"))
     base = trials.base(scenario, load_town(TOWN), seed=0)
@@ -150,7 +150,7 @@ def test_a_program_is_a_generator(braking: Program) -> None:
     assert [o.proposal.scenario for o in again] == [o.proposal.scenario for o in found]
 
 
-def test_command(braking: Program, tmp_path: Path) -> None:
+def test_command(braking: ScenicProgram, tmp_path: Path) -> None:
     done = ssad("import", "scenic", braking.path, tmp_path / "a.yaml", "--map", TOWN, "--count", "2", "--steps", "40")
     assert done.returncode == 0, done.stderr
     assert [s.name for s in read_scenarios(tmp_path / "a.yaml")] == ["braking/00", "braking/01"]

@@ -18,7 +18,7 @@ from ssad.metrics.driving import (
     driving_score,
     in_route_failure,
     mean_yaw_velocity,
-    normalised,
+    normalise_metric,
     off_road_distance,
 )
 
@@ -157,8 +157,8 @@ def test_overall_score_rounds_each_term_and_does_not_clip():
 
 
 def test_normalised_is_clipped():
-    assert normalised("OR", 5.0) == 0.5
-    assert normalised("OR", 50.0) == 1.0
+    assert normalise_metric("OR", 5.0) == 0.5
+    assert normalise_metric("OR", 50.0) == 1.0
 
 
 def test_one_row_has_no_means_and_survives_json():

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace, straight
 
-from ssad.core.perception import Objects, Perceived, Tracks, no_objects
+from ssad.core.perception import DrivePerception, Objects, Tracks, no_objects
 from ssad.core.types import AgentKind, Contact, EpisodeTrace
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, TrackerSettings
 from ssad.metrics.perception_in_drive import (
     BANDS,
     REACH,
@@ -20,8 +20,8 @@ from ssad.metrics.perception_in_drive import (
     hard_braking,
     impact_speed,
     in_view,
-    object_that_matters,
     phantom_stop,
+    relevant_agent,
     sign_metrics,
     track_metrics,
 )
@@ -46,15 +46,15 @@ def objects(*places: tuple[float, float], score: float = 0.9) -> Objects:
 
 
 def tracks(*places: tuple[float, float]) -> Tracks:
-    tracker = KalmanTracker(Tracking(confirm=1))
+    tracker = KalmanTracker(TrackerSettings(confirm=1))
     tracker.update(np.array([0]), np.zeros(1), objects(*places))
     return tracker.confirmed(np.array([0]), np.zeros(1))
 
 
-def perceived(trace: EpisodeTrace, found: Any, known: Any) -> Perceived:
+def perceived(trace: EpisodeTrace, found: Any, known: Any) -> DrivePerception:
     """`found` and `known` give places for a step; None: no picture."""
     looks = [(k * trace.dt, None if found(k) is None else objects(*found(k))) for k in range(0, STEPS, 2)]
-    return Perceived(looks, [(k * trace.dt, tracks(*known(k))) for k in range(STEPS)], CAMERAS)
+    return DrivePerception(looks, [(k * trace.dt, tracks(*known(k))) for k in range(STEPS)], CAMERAS)
 
 
 def towards(gap: float = 25.0, speed: float = 5.0, **changes: Any) -> EpisodeTrace:
@@ -180,10 +180,10 @@ def test_impact_speed_hard_braking_and_the_object_that_matters() -> None:
     accel[[3, 4, 9]] = -5.0
     accel[20] = -3.0
     assert hard_braking(make_trace(STEPS, accel=accel)) == 2
-    assert object_that_matters(trace) == 1
+    assert relevant_agent(trace) == 1
     bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (0.0, 9.0, 0.0, 0.0))
-    assert object_that_matters(make_trace(STEPS, bodies)) == 2
-    assert object_that_matters(make_trace(STEPS)) is None
+    assert relevant_agent(make_trace(STEPS, bodies)) == 2
+    assert relevant_agent(make_trace(STEPS)) is None
 
 
 def test_who_stands_before_nothing_stands_before_a_phantom() -> None:
@@ -209,11 +209,11 @@ def test_signs_are_read_from_how_far_and_where_they_stand() -> None:
     sign = np.array([[30.0, 3.0]])
     # read from 15 m on; before, something is read where no sign stands
     looks = [(k * trace.dt, sign if 30.0 - 0.5 * k <= 15.0 else sign + np.array([0.0, 20.0])) for k in range(STEPS)]
-    found = sign_metrics(trace, Perceived([], [], CAMERAS, looks), sign)
+    found = sign_metrics(trace, DrivePerception([], [], CAMERAS, looks), sign)
     assert found["sign_recall"] == pytest.approx(11 / 41)
     assert (found["sign_recall_5_20"], found["sign_recall_20_40"]) == (pytest.approx(11 / 20), 0.0)
     assert found["sign_read_at"] == pytest.approx(np.hypot(15.0, 3.0))
-    nowhere = sign_metrics(trace, Perceived([], [], CAMERAS, looks), np.zeros((0, 2)))
+    nowhere = sign_metrics(trace, DrivePerception([], [], CAMERAS, looks), np.zeros((0, 2)))
     assert set(nowhere.values()) == {None}
 
 
@@ -241,8 +241,8 @@ def test_who_is_touched_matters_more_than_who_is_near() -> None:
     bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0))
     touched = np.full(STEPS, -1)
     touched[-3:] = 1
-    assert object_that_matters(make_trace(STEPS, bodies, contact_agent=touched)) == 1
-    assert object_that_matters(make_trace(STEPS, bodies)) == 2
+    assert relevant_agent(make_trace(STEPS, bodies, contact_agent=touched)) == 1
+    assert relevant_agent(make_trace(STEPS, bodies)) == 2
 
 
 def test_the_nearest_agent_is_that_whose_end_is_nearest() -> None:
@@ -250,11 +250,11 @@ def test_the_nearest_agent_is_that_whose_end_is_nearest() -> None:
     bodies = ((0.0, 0.0, 0.0, 0.0), (11.0, 0.0, 0.0, 0.0), (8.0, 0.0, 0.0, 0.0), (14.0, 0.0, 0.0, 0.0))
     trace = make_trace(STEPS, bodies)
     trace.length[:] = [4.5, 12.0, 4.5, 15.0]
-    assert object_that_matters(trace) == 1
+    assert relevant_agent(trace) == 1
     trace.active[:, 1] = False
-    assert object_that_matters(trace) == 2
+    assert relevant_agent(trace) == 2
     trace.active[:, 1:] = False
-    assert object_that_matters(trace) is None
+    assert relevant_agent(trace) is None
 
 
 def test_bands_of_distance_join_and_reach_as_far_as_objects_count() -> None:
@@ -294,8 +294,8 @@ def test_tracks_on_the_ego_itself_are_false() -> None:
 def test_a_sign_far_to_the_side_is_not_one_before_the_ego() -> None:
     trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0),))
     read = [(0.0, np.array([[10.0, 4.9]]))]
-    assert sign_metrics(trace, Perceived([], [], CAMERAS, read), np.array([[10.0, 4.9]]))["sign_recall"] == 1.0
-    assert sign_metrics(trace, Perceived([], [], CAMERAS, read), np.array([[10.0, 5.1]]))["sign_recall"] is None
+    assert sign_metrics(trace, DrivePerception([], [], CAMERAS, read), np.array([[10.0, 4.9]]))["sign_recall"] == 1.0
+    assert sign_metrics(trace, DrivePerception([], [], CAMERAS, read), np.array([[10.0, 5.1]]))["sign_recall"] is None
 
 
 def test_a_look_at_the_step_itself_counts_for_the_cause() -> None:
@@ -304,7 +304,7 @@ def test_a_look_at_the_step_itself_counts_for_the_cause() -> None:
     struck[-1] = 1
     trace = make_trace(STEPS, (straight(0.0, 0.0, 0.0, 5.0, STEPS), (25.0, 0.0, 0.0, 0.0)), contact_agent=struck)
     looks = [(k * trace.dt, objects((25.0, 0.0)) if k >= 20 else objects()) for k in range(STEPS)]
-    told = cause_of_collision(trace, Perceived(looks, [], CAMERAS))
+    told = cause_of_collision(trace, DrivePerception(looks, [], CAMERAS))
     assert told is not None
     # from 3 s before the contact to 0.5 s before it: steps 10 to 34, of which 15 have found it and no track has
     assert told["shares"]["late"] == pytest.approx(15 / 25)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
-from ssad.metrics.realism import FEATURES, histogram, motion_features, pooled, realism, wasserstein
+from ssad.metrics.realism import FEATURES, histogram, motion_features, pool_motions, realism, wasserstein
 
 STEP = 0.1 * np.arange(21)
 INSIDE = np.full(21, -3.0)
@@ -65,10 +65,10 @@ def test_the_score_is_the_weighted_likelihood() -> None:
     assert same == pytest.approx((0.05 * full + 0.15 * 40.1 / 41.1 + 0.25 * full + 0.5 * 40.1 / 40.2) / 0.95, rel=1e-9)
     other = realism(values(20.0), reference)
     assert same - other == pytest.approx(0.05 * (40.1 - 0.1) / 41.0 / 0.95, rel=1e-9)
-    assert math.isnan(realism(pooled([]), reference))
+    assert math.isnan(realism(pool_motions([]), reference))
     assert wasserstein(values(20.0), reference)["speed"] == pytest.approx(14.0)
     assert wasserstein(values(20.0), reference)["acceleration"] == 0.0
-    assert math.isnan(wasserstein(pooled([]), reference)["speed"])
+    assert math.isnan(wasserstein(pool_motions([]), reference)["speed"])
 
 
 def test_the_histograms_are_the_challenges() -> None:

@@ -1,4 +1,4 @@
-"""Sample sizes: the power of SSAD's own intervals in simulations, measured flip rates, known formulas."""
+"""CaseSample sizes: the power of SSAD's own intervals in simulations, measured flip rates, known formulas."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from benchmarks.interval_coverage import counts, route_layout
 from ssad.metrics import CaseValue, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES, Clusters, bounded_limits, difference_limits
 from ssad.metrics.sample_size import (
+    CaseSample,
     FlipRate,
-    Sample,
     detectable_difference,
     flip_rate,
     necessary_clusters,
@@ -21,8 +21,8 @@ from ssad.metrics.sample_size import (
 )
 
 
-def sample(clusters: float, size: float) -> Sample:
-    return Sample(float(clusters), float(size), float(size))
+def sample(clusters: float, size: float) -> CaseSample:
+    return CaseSample(float(clusters), float(size), float(size))
 
 
 def share_detected(shares: tuple[float, float], layout: Clusters, correlation: float, draws: int) -> float:
@@ -87,7 +87,7 @@ def test_flips_that_nearly_all_go_one_way_are_planned_with_care(flips: float, si
 def test_unequal_routes_are_planned_by_the_size_of_a_typical_one() -> None:
     natural = np.array([1.0] * 8 + [2.0] * 8 + [6.0] * 8 + [10.0] * 6)
     layout = route_layout(len(natural), natural)
-    sizes = Sample.of([str(route) for route, size in enumerate(natural) for _ in range(int(size))])
+    sizes = CaseSample.of([str(route) for route, size in enumerate(natural) for _ in range(int(size))])
     assert (sizes.clusters, sizes.cases) == (30, natural.sum())
     assert sizes.typical_size == pytest.approx((natural**2).sum() / natural.sum())
     planned = power(0.2, 0.5, sizes, 0.3)

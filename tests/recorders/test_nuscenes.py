@@ -31,8 +31,8 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.recorders.drives import MIX, drive_street, make_drive, thin_shares
-from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.nuscenes import AHEAD, Recording, drive_with_autopilot, record_nuscenes
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.bodies import make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
@@ -150,13 +150,13 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another() -> None:
     kinds: Counter[str] = Counter()
     for town in ("Larkhill", "Twinford"):
         graph, street = load_town(town), cached_street(town)
-        trace = drive(make_drive(graph, key=(3, town), seconds=6.0), graph)
+        trace = drive_with_autopilot(make_drive(graph, key=(3, town), seconds=6.0), graph)
         with plain_bodies():
             cast = place_objects(trace, graph, street, key=(5, town))
         kinds.update(body.kind for body in cast.bodies)
         now = cast.at(3.0, np.array([trace.x[30, 0], trace.y[30, 0]]), 80.0)
         assert len(now) > 8
-        still = [s for s in now if s.body.parked and s.body.kind != "bicycle"]
+        still = [s for s in now if s.body.is_parked and s.body.kind != "bicycle"]
         boxes = [(*s.pose[:2, 3], np.arctan2(s.pose[1, 0], s.pose[0, 0]), *s.body.size[:2]) for s in still]
         for i in range(1, len(boxes)):
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
@@ -267,10 +267,10 @@ def test_long_vehicles_stand_at_the_kerb() -> None:
     found: Counter[str] = Counter()
     for number in range(4):
         graph = load_town("Twinford")
-        trace = drive(make_drive(graph, key=("long", number), seconds=1.0), graph)
+        trace = drive_with_autopilot(make_drive(graph, key=("long", number), seconds=1.0), graph)
         with plain_bodies():
             cast = place_objects(trace, graph, cached_street(graph), key=("long", number))
-        parked = [body for body in cast.bodies if body.parked]
+        parked = [body for body in cast.bodies if body.is_parked]
         found.update(body.kind for body in parked)
         wide = [body for body in parked if body.kind not in RACK]
         for body in wide:
@@ -294,7 +294,7 @@ def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
         record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_clips(TargetRecording(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
+        record_target_images(TargetRecording(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
     assert "\n" not in str(error.value)
     with np.load(town) as stored:
         arrays = dict(stored)

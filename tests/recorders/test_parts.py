@@ -55,11 +55,11 @@ def test_finished_parts_stand_after_kill_9_and_the_interrupted_one_is_made_again
     process = run(tmp_path, stop_at)
     wait_until_stopped(process)
     parts = PartsFolder(tmp_path, REQUESTED)
-    with pytest.raises(StoreError, match="another ssad record"), parts.held("ssad record"):
+    with pytest.raises(StoreError, match="another ssad record"), parts.lock("ssad record"):
         pass
     assert kill_9(process)
     process.communicate()
-    assert [name for name in ("a", "b", "c") if parts.finished(name)] == whole
+    assert [name for name in ("a", "b", "c") if parts.is_finished(name)] == whole
     before = {path: path.stat().st_ino for name in whole for path in parts.part(name).iterdir()}
     assert run(tmp_path, 0).wait() == 0
     for name in ("a", "b", "c"):
@@ -73,9 +73,9 @@ def test_finished_parts_stand_after_kill_9_and_the_interrupted_one_is_made_again
 
 def test_another_request_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
     parts = PartsFolder(tmp_path, REQUESTED)
-    assert not parts.claimed
+    assert not parts.is_claimed
     parts.claim()
-    assert parts.claimed
+    assert parts.is_claimed
     text = (tmp_path / FOLDER / REQUEST).read_text()
     with pytest.raises(StoreError, match="another recording"):
         PartsFolder(tmp_path, REQUESTED | {"seed": 1}).claim()

@@ -30,7 +30,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, EpisodeTrace
 from ssad.experiments.perception.physical.target_views import solid_target, target_truth
 from ssad.recorders.drives import make_drive
-from ssad.recorders.nuscenes import drive
+from ssad.recorders.nuscenes import drive_with_autopilot
 from ssad.recorders.target_images import (
     CLASSES,
     HIDDEN,
@@ -38,12 +38,21 @@ from ssad.recorders.target_images import (
     SECONDS,
     TARGET,
     _body_of_target,
-    clip_views,
-    record_clips,
+    record_target_images,
+    recorded_views,
 )
 from ssad.recorders.target_recording import FOCAL, SMALL, TargetRecording, pair_images
-from ssad.recorders.viewpoints import AIM, CAR_EYE, MIN_CAMERA_HEIGHT, follow, look_at, polar, turn_of, weather_name
-from ssad.rendering.camera.labels import label_picture
+from ssad.recorders.viewpoints import (
+    AIM,
+    CAR_EYE,
+    MIN_CAMERA_HEIGHT,
+    following_viewpoints,
+    look_at,
+    polar,
+    shuffled_cells,
+    weather_name,
+)
+from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.scene_objects import SceneObjects
@@ -98,7 +107,7 @@ def _stopped_recording(out: Path) -> None:
         raise Stopped
 
     with pytest.raises(Stopped):
-        record_clips(todo(out, "drive"), workers=0, progress=stop)
+        record_target_images(todo(out, "drive"), workers=0, progress=stop)
     assert not (out / "annotations").exists()
     page = out / ".parts" / "drive-twinford-000" / "part.json"
     assert list((out / ".parts").glob("*/part.json")) == [page]
@@ -106,7 +115,7 @@ def _stopped_recording(out: Path) -> None:
     (out / "images" / "drive-oldmarket-000-001.jpg").write_bytes(b"torn")
     steps: list[tuple[int, int]] = []
     before = page.stat().st_mtime_ns
-    record_clips(todo(out, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
+    record_target_images(todo(out, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
     assert steps == [(1, 2), (2, 2)]
     assert page.stat().st_mtime_ns == before, "what was there is left alone"
 
@@ -115,12 +124,12 @@ def _stopped_recording(out: Path) -> None:
 def market() -> EpisodeTrace:
     """The drive of the pictures in Oldmarket, driven again."""
     graph = load_town("Oldmarket")
-    return drive(make_drive(graph, key=("clips", 0, "drive", "Oldmarket", 0, 0), seconds=SECONDS), graph)
+    return drive_with_autopilot(make_drive(graph, key=("clips", 0, "drive", "Oldmarket", 0, 0), seconds=SECONDS), graph)
 
 
 @pytest.fixture(scope="session")
 def orbits(shared: Shared) -> Path:
-    return shared("clips-orbit", lambda out: record_clips(todo(out, "orbit"), workers=0))
+    return shared("clips-orbit", lambda out: record_target_images(todo(out, "orbit"), workers=0))
 
 
 def target_of(data: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
@@ -293,19 +302,19 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
     folder = request.getfixturevalue(mode)
     rows = read(folder, "test")["images"]
     with plain_bodies() if mode == "drives" else contextlib.nullcontext():
-        again = list(clip_views(folder, split="test"))
+        again = list(recorded_views(folder, split="test"))
     assert [v.file for v in again] == [row["file_name"] for row in rows]
     scenes = {(v.row["town"], v.row["part"], v.row["attempt"], id(v.scene)) for v in again}
     assert len(scenes) == len({key[:3] for key in scenes}), "pictures of a drive share a scene"
     for seen in again:
         picture = render(seen.scene, [seen.view])
         assert encode_jpeg(picture.image[0], 92, "420") == (folder / "images" / seen.file).read_bytes()
-        labels = label_picture(seen.scene, seen.view, picture)
+        labels = label_image(seen.scene, seen.view, picture)
         target = next(o for o in seen.objects if o["target"])
         x, y, w, h = target["bbox"]
         assert labels.box[labels.tag == TARGET][0].tolist() == [x, y, x + w, y + h]
         assert seen.view.objects[0].tag == TARGET
-        worn = seen.wearing(TextureLayer(4)).objects
+        worn = seen.with_layers(TextureLayer(4)).objects
         assert worn[0].layers == (TextureLayer(4),)
         assert worn[1:] == seen.view.objects[1:]
 
@@ -314,8 +323,10 @@ def test_an_orbit_of_a_stop_sign_shows_its_face(tmp_path: Path) -> None:
     target = TargetSign("large", seed=2)
     given: dict[str, Any] = {"distances": (5.0, 9.0), "azimuths": (), "elevations": ()}
     with two_phases():
-        record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
-        views = list(clip_views(tmp_path))
+        record_target_images(
+            todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0
+        )
+        views = list(recorded_views(tmp_path))
     data = read(tmp_path)
     assert data["info"]["recording"]["target"]["kind"] == "stop_sign"
     assert len(views) == 2
@@ -375,7 +386,7 @@ def test_clip_views_refuses_what_it_does_not_know(drives: Path, tmp_path: Path) 
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "all.json").write_text(json.dumps(data))
     with pytest.raises(FormatError, match="record them again"):
-        next(clip_views(tmp_path))
+        next(recorded_views(tmp_path))
 
 
 @BOTH
@@ -403,7 +414,7 @@ def test_pycocotools_reads_it_and_the_truth_scores_1(mode: str, request: pytest.
 @pytest.mark.slow
 def test_same_bytes_for_two_workers_and_after_a_stop(tmp_path: Path) -> None:
     """That processes do not matter is shown of drives in the nuScenes schema by default: they share the code."""
-    record_clips(todo(tmp_path / "two", "drive"), workers=2)
+    record_target_images(todo(tmp_path / "two", "drive"), workers=2)
     _stopped_recording(tmp_path / "stopped")
     assert contents(tmp_path / "two") == contents(tmp_path / "stopped")
 
@@ -411,14 +422,14 @@ def test_same_bytes_for_two_workers_and_after_a_stop(tmp_path: Path) -> None:
 def test_recording_again_changes_nothing(drives: Path) -> None:
     before = contents(drives)
     steps: list[tuple[int, int]] = []
-    record_clips(todo(drives, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
+    record_target_images(todo(drives, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
     assert contents(drives) == before
     assert steps == [(1, 2), (2, 2)]
 
 
 @pytest.mark.slow
 def test_same_bytes_of_an_orbit_for_two_workers_and_after_kill_9(orbits: Path, tmp_path: Path) -> None:
-    record_clips(todo(tmp_path / "d", "orbit"), workers=2)
+    record_target_images(todo(tmp_path / "d", "orbit"), workers=2)
     assert contents(tmp_path / "d") == contents(orbits)
     command = [sys.executable, "-m", "ssad", "record", str(tmp_path / "e"), "--clips", "orbit", "--images", "2,1"]
     command += ["--towns", "Twinford,Oldmarket", "--held-out", "Oldmarket", "--target", "van:white:3", "--workers", "2"]
@@ -436,7 +447,7 @@ def test_same_bytes_of_an_orbit_for_two_workers_and_after_kill_9(orbits: Path, t
 
 @pytest.mark.slow
 def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_path: Path) -> None:
-    out = record_clips(todo(tmp_path, "orbit", images=(("Crossgate", 36),), held_out=()), workers=2)
+    out = record_target_images(todo(tmp_path, "orbit", images=(("Crossgate", 36),), held_out=()), workers=2)
     data = read(out)
     assert len({row["drive"] for row in data["images"]}) >= 2
     assert len({(row["distance"], row["azimuth"], row["elevation"]) for row in data["images"]}) == 36
@@ -446,19 +457,19 @@ def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_pa
 def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path) -> None:
     for changes in ({"seed": 1}, {"size": 168}, {"target": TargetCar("van")}, {"images": PAIRS[:1]}):
         with pytest.raises(StoreError, match="another recording") as error:
-            record_clips(todo(drives, "drive", **changes), workers=0)
+            record_target_images(todo(drives, "drive", **changes), workers=0)
         assert "\n" not in str(error.value)
     with pytest.raises(StoreError, match="another recording"):
-        record_clips(todo(drives, "orbit"), workers=0)
+        record_target_images(todo(drives, "orbit"), workers=0)
     (tmp_path / "annotations").mkdir()
     for text in ("{}", "[]", '{"info": 5}', '{"info": {"recording": {}}}', '{"images": [], "annotations": []}'):
         (tmp_path / "annotations" / "all.json").write_text(text)
         with pytest.raises(StoreError, match="another recording"):
-            record_clips(todo(tmp_path, "drive"), workers=0)
+            record_target_images(todo(tmp_path, "drive"), workers=0)
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(StoreError) as error:
-        record_clips(todo(blocked / "out", "drive"), workers=0)
+        record_target_images(todo(blocked / "out", "drive"), workers=0)
     assert "\n" not in str(error.value)
 
 
@@ -525,12 +536,12 @@ def test_the_command_says_what_is_wrong_in_one_line(
 
 
 def test_every_cell_comes_once_in_a_turn() -> None:
-    whole = turn_of(range(120), 40, key=(0, "town"))
+    whole = shuffled_cells(range(120), 40, key=(0, "town"))
     for k in range(3):
         assert sorted(whole[40 * k : 40 * k + 40]) == list(range(40))
     assert whole[:40] != whole[40:80], "each turn has its own order"
-    assert turn_of(range(25, 50), 40, key=(0, "town")) == whole[25:50], "parts fit together"
-    assert turn_of(range(40), 40, key=(1, "town")) != whole[:40]
+    assert shuffled_cells(range(25, 50), 40, key=(0, "town")) == whole[25:50], "parts fit together"
+    assert shuffled_cells(range(40), 40, key=(1, "town")) != whole[:40]
 
 
 def test_a_camera_looks_at_its_point_upright() -> None:
@@ -549,7 +560,7 @@ def test_a_camera_looks_at_its_point_upright() -> None:
 
 def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace) -> None:
     def shots(behind: float) -> list[Any]:
-        return follow(market, SceneWeather(), behind=behind, height=2.0, count=4, rng=generator(1))
+        return following_viewpoints(market, SceneWeather(), behind=behind, height=2.0, count=4, rng=generator(1))
 
     found = shots(20.0)
     assert len(found) > 20

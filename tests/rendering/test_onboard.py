@@ -140,7 +140,7 @@ def test_cameras_that_are_read_together_are_rendered_at_once_and_show_the_same(
     monkeypatch.setattr(loop_sensors, "AT_ONCE", 6)
     onboard = Onboard()
     onboard.resident = resident  # as on a GPU
-    sensors = onboard.together(cameras)
+    sensors = onboard.group_cameras(cameras)
     for _ in range(2):
         for name, sensor in sensors.items():
             shown = sensor(simulator, agents)
@@ -233,7 +233,7 @@ def test_lit_signals_are_seen(lit: SignalState) -> None:
     moment = replace(dark, signal=np.full(len(looks.signals), lit, np.uint8))
     pictures = []
     for now in (dark, moment):
-        view = onboard.view(loop_sensors.Sight(0, scene, looks, now, 0), camera)
+        view = onboard.view(loop_sensors.AgentView(0, scene, looks, now, 0), camera)
         pictures.append(render(scene.scene, [view]).image[0].astype(int))
     change = np.abs(pictures[1] - pictures[0]).max(-1)
     rows, columns = np.nonzero(change > 60)
@@ -254,14 +254,14 @@ def test_weather_goes_by_episode_and_lamps_are_on_by_night(driven) -> None:
     day = camera.of_trace(traces[1], town(), steps=[0])[0]
     assert np.array_equal(day, watcher.shown["front", 1, 0, 0])
     assert not np.array_equal(dark, watcher.shown["front", 0, 0, 0])
-    (sight,) = night.sights_of_trace(traces[0], town(), steps=[0])
+    (sight,) = night.trace_views(traces[0], town(), steps=[0])
     (lamp,) = night.view(sight, FRONT).lamps
     nose = np.linalg.inv(sight.pose) @ lamp.pose[:, 3]
     assert nose[:3] == pytest.approx([2.45, 0.0, 0.65])  # the bumper of a car of 4.9 m
     walker = loop_sensors.MODELS["walker"]
     assert walker.kind == AgentKind.WALKER
     on_foot = next(a for a, model in enumerate(traces[0].models) if model == "walker")
-    (sight,) = night.sights_of_trace(traces[0], town(), agent=on_foot, steps=[0])
+    (sight,) = night.trace_views(traces[0], town(), agent=on_foot, steps=[0])
     assert night.view(sight, FRONT).lamps == ()
 
 
@@ -303,7 +303,7 @@ def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest
 
     watcher = Watcher("CAM_BACK")
     short = replace(episodes()[0], limits=EpisodeLimits(max_steps=2))
-    monkeypatch.setattr(driving, "episode_of", lambda cell: short)
+    monkeypatch.setattr(driving, "build_requested_episode", lambda cell: short)
     monkeypatch.setattr(driving, "system_of", lambda name: watcher)
     cell = SimpleNamespace(key="a", system="watcher", spec={"scenario": {"type": short.scenario.type}})
     _, (trace,), measured = driving.drive([cell], device="cpu")

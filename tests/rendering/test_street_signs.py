@@ -12,10 +12,10 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, LaneType
 from ssad.datasets.coco import coco_data
-from ssad.recorders.target_images import CLASSES, faces, label_of
+from ssad.recorders.target_images import CLASSES, is_facing, label_of
 from ssad.recorders.target_recording import BEHIND
 from ssad.rendering.bodies import make_body
-from ssad.rendering.scene_objects import GroundOccupancy, SceneObjects, _signs
+from ssad.rendering.scene_objects import GroundOccupancy, SceneObjects, _add_signs
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import StreetSign, plate_and_post, street_signs
 from ssad.world.roads import load_town
@@ -42,7 +42,7 @@ def stand(town: str, *, many: bool, key: int = 0) -> list[StreetSign]:
 
 def nearest_lane(graph: LaneGraph, xy: F64) -> tuple[float, float]:
     """Distance to the nearest driving lane's middle less half its width, and that lane's heading."""
-    lane = np.repeat(np.arange(graph.lanes), np.diff(graph.offset))
+    lane = np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))
     keep = (graph.kind[lane] == LaneType.DRIVING) & (graph.junction[lane] < 0)
     away = np.hypot(*(graph.xy[keep] - xy).T) - 0.5 * graph.width[keep]
     nearest = int(away.argmin())
@@ -101,7 +101,7 @@ def test_where_something_stands_a_sign_moves_or_is_left_out() -> None:
 def test_the_plate_is_labelled_and_the_post_is_not() -> None:
     graph = ground("Oldmarket")[0]
     cast = SceneObjects(0.1, ("signs",), detail=1)
-    _signs(cast, graph, graph.sign_xy.astype(np.float64), clear_ground("Oldmarket"), many=False)
+    _add_signs(cast, graph, graph.sign_xy.astype(np.float64), clear_ground("Oldmarket"), many=False)
     plates, posts = cast.bodies[::2], cast.bodies[1::2]
     assert {body.kind for body in plates} == {"stop_sign", "yield_sign"}
     assert {body.kind for body in posts} == {""}
@@ -129,7 +129,7 @@ def test_a_sign_is_read_from_the_front_alone() -> None:
 
     def seen(degrees: float) -> bool:
         turn = 2.0 + np.radians(degrees)
-        return faces(sign, np.array([4.0 + 9.0 * np.cos(turn), -3.0 + 9.0 * np.sin(turn), 1.6]))
+        return is_facing(sign, np.array([4.0 + 9.0 * np.cos(turn), -3.0 + 9.0 * np.sin(turn), 1.6]))
 
     assert [seen(a) for a in (0, 60, -60, BEHIND - 1, 1 - BEHIND)] == [True] * 5
     assert [seen(a) for a in (BEHIND + 1, -BEHIND - 1, 120, 180)] == [False] * 4

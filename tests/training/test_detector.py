@@ -17,7 +17,7 @@ from ssad.cli import main
 from ssad.core.checkpoints import read_card
 from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import SHIPPED, make_detector
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import parse_target
 from ssad.training import detector as training
@@ -33,7 +33,7 @@ def clips(shared: Shared) -> Path:
 
     def make(out: Path) -> None:
         with plain_bodies():
-            record_clips(TargetRecording(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
+            record_target_images(TargetRecording(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
 
     return shared("clips", make)
 
@@ -98,7 +98,7 @@ def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: P
 @pytest.mark.parametrize("text", ["[1, 2]", '{"config": [3]}', "{}"])
 def test_first_weights_with_a_page_that_is_no_card(text: str, tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text(text)
-    assert training._before(tmp_path / "w.safetensors") == {"first_weights": {"file": "w.safetensors"}}
+    assert training._weights_origin(tmp_path / "w.safetensors") == {"first_weights": {"file": "w.safetensors"}}
 
 
 def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
@@ -113,7 +113,7 @@ def test_other_data_and_other_first_weights_are_refused(
     done: Path, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = DetectorPlan("yolov5n", (clips,), done, changes=SHORT, device="cpu")
-    monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
+    monkeypatch.setattr(training, "load_images", lambda *a, **k: pytest.fail("pictures were read"))
     with pytest.raises(FormatError, match="of other data, other first weights"):
         list(run_training(replace(plan, weights=done / "yolov5n.safetensors")))
     with pytest.raises(FormatError, match="of other data, other first weights"):
@@ -125,7 +125,7 @@ def test_other_data_and_other_first_weights_are_refused(
 def test_what_is_missing_is_said_before_anything_is_read(
     clips: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
+    monkeypatch.setattr(training, "load_images", lambda *a, **k: pytest.fail("pictures were read"))
     flat = DetectorPlan("yolov5n", (clips,), tmp_path / "out", changes=SHORT, device="cpu")
     deep = replace(flat, recipe="fcos3d-light", data=(drives,))
     twin = tmp_path / "clips"
@@ -196,9 +196,9 @@ def test_the_command_can_be_given_to_a_shell() -> None:
 
 def test_an_error_of_a_process_is_what_it_was() -> None:
     text = "\n\n-- Process 1 terminated with the following error:\nTraceback (most recent call last):\n  File x\n"
-    with pytest.raises(ConfigError, match=r"^no such thing: here$"), training._one_line():
+    with pytest.raises(ConfigError, match=r"^no such thing: here$"), training._rewrap_worker_errors():
         raise ProcessRaisedException(f"{text}ssad.core.errors.ConfigError: no such thing: here\n", 1, 7)
-    with pytest.raises(ProcessRaisedException, match="KeyError: 'x'"), training._one_line():
+    with pytest.raises(ProcessRaisedException, match="KeyError: 'x'"), training._rewrap_worker_errors():
         raise ProcessRaisedException(f"{text}KeyError: 'x'\n", 1, 7)
 
 
@@ -206,7 +206,7 @@ def test_an_error_of_a_process_is_what_it_was() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_an_error_in_another_process_is_one_line(count: int, tmp_path: Path) -> None:
     plan = DetectorPlan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=count)
-    with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._one_line():
+    with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._rewrap_worker_errors():
         spawn(training._worker, (plan, find_recipe("yolov5n"), training._free_port(), "gloo"), nprocs=count)
 
 

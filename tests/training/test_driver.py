@@ -18,7 +18,7 @@ from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.drivers.learned.policies import PPO
 from ssad.training.adversary import AdversaryPlan, run_adversary_training
 from ssad.training.driver import DriverPlan, draw_episodes, find_scenarios, run_driver_training
-from ssad.training.reinforcement import LEARNINGS, find_learning, learn, make_model, read_log
+from ssad.training.reinforcement import POLICY_RECIPES, find_policy_recipe, make_model, read_log, train_policy
 from ssad.world.actions import CHOICES
 from ssad.world.policy import load_policy
 
@@ -89,20 +89,23 @@ def test_a_training_begins_with_the_networks_of_another(tmp_path: Path) -> None:
 
 def test_what_is_learned_is_what_is_exported(tmp_path: Path) -> None:
     """The exported policy acts as the model of stable-baselines3 does without its noise."""
-    more = {"ddpg": replace(LEARNINGS["td3"], algorithm="ddpg"), "dqn": replace(LEARNINGS["sac"], algorithm="dqn")}
+    more = {
+        "ddpg": replace(POLICY_RECIPES["td3"], algorithm="ddpg"),
+        "dqn": replace(POLICY_RECIPES["sac"], algorithm="dqn"),
+    }
     for algorithm in ("ppo", "sac", "td3", "ddpg", "dqn"):
-        learning = find_learning(LEARNINGS | more, algorithm, dict(SMALL))
-        from ssad.training.reinforcement import policy_now
+        learning = find_policy_recipe(POLICY_RECIPES | more, algorithm, dict(SMALL))
+        from ssad.training.reinforcement import current_policy
 
         model = make_model(learning, environment(learning))
         rows = np.random.default_rng(0).normal(0, 1, (8, 69)).astype(np.float32)
         expected, _ = model.predict(rows, deterministic=True)
         expected = CHOICES[expected] if algorithm == "dqn" else expected
-        np.testing.assert_allclose(policy_now(model, learning).actions(rows), expected, atol=1e-5)
+        np.testing.assert_allclose(current_policy(model, learning).actions(rows), expected, atol=1e-5)
 
 
 def test_a_training_that_chooses_needs_an_action_of_two_numbers() -> None:
-    learning = replace(find_learning(LEARNINGS, "sac", dict(SMALL)), algorithm="dqn", action="frea")
+    learning = replace(find_policy_recipe(POLICY_RECIPES, "sac", dict(SMALL)), algorithm="dqn", action="frea")
     with pytest.raises(ConfigError, match="between actions of two numbers"):
         make_model(learning, environment(learning))
 
@@ -117,7 +120,7 @@ def environment(learning):
 
 
 def test_a_diverging_training_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
-    learning = replace(find_learning(LEARNINGS, "ppo", dict(SMALL)), validate=128)
+    learning = replace(find_policy_recipe(POLICY_RECIPES, "ppo", dict(SMALL)), validate=128)
     model = make_model(learning, environment(learning))
 
     def poison(policy) -> dict[str, float]:
@@ -127,7 +130,7 @@ def test_a_diverging_training_keeps_the_last_good_checkpoint(tmp_path: Path) -> 
         return {"score": 0.0}
 
     with pytest.raises(ConfigError, match="diverged before step") as found:
-        learn(model, learning, tmp_path, validate=poison, report=lambda line: None)
+        train_policy(model, learning, tmp_path, validate=poison, report=lambda line: None)
     assert "\n" not in str(found.value)
     assert f"{tmp_path / 'last.pt'} is of step" in str(found.value)
     kept = torch.load(tmp_path / "last.pt", weights_only=True)

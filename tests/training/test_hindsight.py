@@ -41,7 +41,7 @@ def played(own: np.ndarray, other: np.ndarray, bend: float | None = None) -> tup
         rows = np.stack([mine, its])[None].astype(np.float32)
         point = np.maximum(rows[..., 0] - 10.0, 0.0).astype(np.int32)
         state = replace(base, pose=rows[..., :3], speed=rows[..., 3], progress=point)
-        memory.note(state)
+        memory.record(state)
     return memory, state
 
 
@@ -73,33 +73,33 @@ BRAKES[:, 0] = 60.0 + np.cumsum(0.1 * BRAKES[:, 3]) - 0.1 * BRAKES[:, 3].sum()
 )
 def test_what_the_driver_of_regulation_157_avoids(own: np.ndarray, other: np.ndarray, avoided: bool) -> None:
     memory, state = played(own, other)
-    assert memory.avoided(state, BOTH).tolist() == [avoided]
+    assert memory.is_avoidable(state, BOTH).tolist() == [avoided]
 
 
 @pytest.mark.parametrize("lead", [3.0, 5.0, 7.0])
 def test_the_human_stays_behind_a_slower_car_it_has_braked_for(lead: float) -> None:
     memory, state = played(moves(60.0, speed=8.0), moves(60.0 + LONG, speed=lead))
     memory.model = careful_model("cc")
-    assert memory.avoided(state, BOTH).tolist() == [True]
+    assert memory.is_avoidable(state, BOTH).tolist() == [True]
 
 
 @pytest.mark.parametrize(("bend", "avoided"), [(None, False), (54.0, True), (85.0, False), (15.0, False)])
 def test_it_slows_down_for_bends_on_its_way(bend: float | None, avoided: bool) -> None:
     memory, state = played(moves(60.0, speed=10.0), moves(63.4, 0.0, 12.0, np.pi / 2, -1), bend)
-    assert memory.avoided(state, BOTH).tolist() == [avoided]
+    assert memory.is_avoidable(state, BOTH).tolist() == [avoided]
 
 
 def test_a_scene_that_starts_again_remembers_nothing() -> None:
     own, other = moves(60.0, speed=10.0), moves(60.0 + LONG)
     memory, state = played(own, other)
     memory.forget([0])
-    memory.note(state)
-    assert not memory.avoided(state, BOTH)[0]
+    memory.record(state)
+    assert not memory.is_avoidable(state, BOTH)[0]
 
 
 def test_scenes_do_not_depend_on_each_other() -> None:
     pairs = [(moves(60.0, speed=10.0), moves(60.0 + LONG)), (moves(60.0), moves(60.0 - LONG, speed=9.0))]
-    alone = [memory.avoided(state, BOTH)[0] for memory, state in (played(*pair) for pair in pairs)]
+    alone = [memory.is_avoidable(state, BOTH)[0] for memory, state in (played(*pair) for pair in pairs)]
     world = World(
         [episode(ego(), EpisodeAgent("o", "car", Controller.NONE, Pose(60.0, 0.0)), key=k) for k in "ab"], GRAPHS
     )
@@ -108,5 +108,5 @@ def test_scenes_do_not_depend_on_each_other() -> None:
         now = np.stack(rows).astype(np.float32)
         point = np.maximum(now[..., 0] - 10.0, 0.0).astype(np.int32)
         state = replace(state, pose=now[..., :3], speed=now[..., 3], progress=point)
-        memory.note(state)
-    assert memory.avoided(state, np.array([[0, 1], [1, 1]], np.int32)).tolist() == alone == [True, False]
+        memory.record(state)
+    assert memory.is_avoidable(state, np.array([[0, 1], [1, 1]], np.int32)).tolist() == alone == [True, False]

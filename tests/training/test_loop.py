@@ -26,25 +26,25 @@ from ssad.detectors.mono3d.decode import hull, project
 from ssad.training import loop
 from ssad.training.batches import (
     Augmentation,
-    OnDisk,
+    ImagesOnDisk,
     TrainingImage,
-    change_colours,
-    change_pictures,
-    change_truths,
-    draw_change,
-    fill,
+    augment_colours,
+    augment_images,
+    augment_truths,
+    draw_augmentation,
+    load_images,
     make_batch,
     order,
-    repeats,
+    repetition_counts,
 )
 from ssad.training.detector import parse_changes
-from ssad.training.loop import LAST_CHECKPOINT, LOG, train, weighed
-from ssad.training.recipe import RECIPES, Recipe, find_recipe, set_words
+from ssad.training.loop import LAST_CHECKPOINT, LOG, train, weighted_sum
+from ssad.training.recipe import RECIPES, Recipe, command_line_changes, find_recipe
 
 
 def change_truth(truth: Truth, change: Augmentation, size: tuple[int, int], *, keep: float) -> Truth:
     """Truth of one changed picture."""
-    return change_truths([truth], [change], size, min_visible_share=keep)[0]
+    return augment_truths([truth], [change], size, min_visible_share=keep)[0]
 
 
 def same(a: Any, b: Any) -> bool:
@@ -247,12 +247,12 @@ def with_classes(*labels: int, crowd: bool = False) -> Truth:
 
 def test_pictures_of_rare_classes_are_repeated() -> None:
     truths = [with_classes(0)] * 98 + [with_classes(0, 1)] + [with_classes(2, crowd=True)]
-    often = repeats(truths, 0.04)
+    often = repetition_counts(truths, 0.04)
     assert often is not None
     np.testing.assert_allclose(often[:98], 1.0)
     np.testing.assert_allclose(often[98], 2.0)  # sqrt(0.04 / 0.01)
     assert often[99] == 1.0, "what is not learned from does not count"
-    assert repeats(truths, 0.0) is None
+    assert repetition_counts(truths, 0.0) is None
 
 
 @given(st.integers(0, 10**6), st.integers(1, 7), st.lists(st.floats(1.0, 3.0), min_size=8, max_size=40))
@@ -276,7 +276,7 @@ def test_a_zoom_is_about_the_principal_point() -> None:
     recipe = replace(find_recipe("fcos3d-light"), zoom=(0.5, 2.0))
     rng = np.random.default_rng(3)
     for _ in range(20):
-        change = draw_change(recipe, (40, 80), rng, lens=lens)
+        change = draw_augmentation(recipe, (40, 80), rng, lens=lens)
         truth = change_truth(
             Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4), intrinsic=lens), change, (40, 80), keep=0
         )
@@ -290,7 +290,7 @@ def test_a_picture_that_rises_takes_its_lens_along() -> None:
     truth = some_truth(3, size=(40, 80), focal=60.0)
     recipe = replace(find_recipe("fcos3d-light"), zoom=(1.0, 1.0), flip=0.0, rise=6.0)
     rng = np.random.default_rng(5)
-    moved = [draw_change(recipe, (40, 80), rng, lens=truth.intrinsic).shift for _ in range(50)]
+    moved = [draw_augmentation(recipe, (40, 80), rng, lens=truth.intrinsic).shift for _ in range(50)]
     assert {across for across, _ in moved} == {0.0}
     assert -6 <= min(down for _, down in moved) < -3 < 3 < max(down for _, down in moved) <= 6
     after = change_truth(truth, Augmentation(False, 1.0, moved[0]), (40, 80), keep=0)
@@ -305,10 +305,10 @@ def test_a_picture_that_rises_takes_its_lens_along() -> None:
 
 def test_losses_are_weighed_by_name() -> None:
     losses = {"one": torch.tensor(2.0), "two": torch.tensor(3.0)}
-    assert float(weighed(losses, {})) == 5.0
-    assert float(weighed(losses, {"two": 0.5})) == 3.5
+    assert float(weighted_sum(losses, {})) == 5.0
+    assert float(weighted_sum(losses, {"two": 0.5})) == 3.5
     with pytest.raises(ConfigError, match="there is no loss 'three'; there are one, two"):
-        weighed(losses, {"three": 1.0})
+        weighted_sum(losses, {"three": 1.0})
 
 
 def test_a_batch_is_decided_by_its_key() -> None:
@@ -332,17 +332,17 @@ def test_pictures_that_do_not_fit_are_read_when_they_are_wanted(monkeypatch: pyt
         )  # type: ignore[misc]
         for k in range(9)
     ]
-    held = fill(items)
+    held = load_images(items)
     monkeypatch.setattr("ssad.training.batches.free_memory", lambda device: 100.0)
-    bank = fill(items)
-    assert isinstance(bank.pictures, OnDisk)
+    bank = load_images(items)
+    assert isinstance(bank.pictures, ImagesOnDisk)
     rows = torch.tensor([8, 0, 3])
     assert torch.equal(bank.pictures[rows], held.pictures[rows])
     assert torch.equal(bank.pictures[2:5], held.pictures[2:5])
     where = torch.device("cpu")
     one, two = (make_batch(b, [4, 1], RECIPE, key=(1, 2), device=where)[0] for b in (bank, held))
     assert torch.equal(one, two)
-    broken = fill([*items[:-1], TrainingImage(lambda: np.zeros((5, 8, 3), np.uint8), items[0].truth)])
+    broken = load_images([*items[:-1], TrainingImage(lambda: np.zeros((5, 8, 3), np.uint8), items[0].truth)])
     with pytest.raises(ConfigError, match="picture 8 has the size"):
         _ = broken.pictures[torch.tensor([8])]
 
@@ -353,9 +353,9 @@ def test_a_prefix_that_freezes_nothing_is_one_line(tmp_path: Path) -> None:
 
 
 def test_other_data_or_first_weights_in_the_same_folder_are_one_line(tmp_path: Path) -> None:
-    train(fresh(), bank(), RECIPE, out=tmp_path, about="a")
+    train(fresh(), bank(), RECIPE, out=tmp_path, metadata="a")
     with pytest.raises(FormatError, match="of other data, other first weights"):
-        train(fresh(), bank(), RECIPE, out=tmp_path, about="b")
+        train(fresh(), bank(), RECIPE, out=tmp_path, metadata="b")
 
 
 def test_pictures_are_read_in_order_and_must_be_of_one_size() -> None:
@@ -365,12 +365,12 @@ def test_pictures_are_read_in_order_and_must_be_of_one_size() -> None:
         return data.pictures[k].numpy()
 
     items = [TrainingImage(lambda k=k: reader(k), truth) for k, truth in enumerate(data.truth)]  # type: ignore[misc]
-    assert torch.equal(fill(items).pictures, data.pictures)
+    assert torch.equal(load_images(items).pictures, data.pictures)
     items.append(TrainingImage(lambda: np.zeros((5, 7, 3), np.uint8), data.truth[0]))
     with pytest.raises(ConfigError, match=r"picture 40 has the size \(5, 7\)"):
-        fill(items)
+        load_images(items)
     with pytest.raises(ConfigError, match="no picture to train on"):
-        fill([])
+        load_images([])
 
 
 def coloured(picture: Tensor, label: int) -> Tensor:
@@ -384,9 +384,9 @@ def test_boxes_stay_on_their_squares(zoom: tuple[float, float]) -> None:
     data, recipe = bank(12), replace(RECIPE, zoom=zoom, keep=0.0)
     rng = np.random.default_rng(4)
     pictures = data.pictures.permute(0, 3, 1, 2).float() / 255
-    changes = [draw_change(recipe, SIZE, rng) for _ in data.truth]
+    changes = [draw_augmentation(recipe, SIZE, rng) for _ in data.truth]
     assert len({one.mirror for one in changes}) == 2
-    changed = change_pictures(pictures, changes)
+    changed = augment_images(pictures, changes)
     count = 0
     for picture, change, truth in zip(changed, changes, data.truth, strict=True):
         after = change_truth(truth, change, SIZE, keep=recipe.keep)
@@ -420,15 +420,15 @@ def test_objects_that_are_cut_become_crowd() -> None:
 def test_a_change_that_does_nothing_leaves_the_picture() -> None:
     pictures = torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     nothing = Augmentation(False, 1.0, (0.0, 0.0))
-    assert torch.equal(change_pictures(pictures, [nothing, nothing]), pictures)
-    mirrored = change_pictures(pictures, [Augmentation(True, 1.0, (0.0, 0.0)), nothing])
+    assert torch.equal(augment_images(pictures, [nothing, nothing]), pictures)
+    mirrored = augment_images(pictures, [Augmentation(True, 1.0, (0.0, 0.0)), nothing])
     torch.testing.assert_close(mirrored[0], pictures[0].flip(2))
     torch.testing.assert_close(mirrored[1], pictures[1])
 
 
 def test_what_is_shrunk_is_averaged() -> None:
     stripes = (torch.arange(96) % 2).float().expand(1, 3, 65, 96)
-    (shrunk,) = change_pictures(stripes, [Augmentation(False, 0.4, (0.0, 0.0))])
+    (shrunk,) = augment_images(stripes, [Augmentation(False, 0.4, (0.0, 0.0))])
     assert shrunk[:, 2:24, 2:36].std() < 0.05  # 0.25 if taken from the pixels as they are
     assert shrunk[:, 2:24, 2:36].mean() == pytest.approx(0.5, abs=0.02)
 
@@ -437,8 +437,8 @@ def test_colours_stay_colours() -> None:
     pictures = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     draws = torch.Generator().manual_seed(1)
     plain = replace(RECIPE, jitter=0.0, noise=0.0)
-    assert torch.equal(change_colours(pictures, plain, draws), pictures)
-    changed = change_colours(pictures, replace(RECIPE, jitter=0.9, noise=0.3), draws)
+    assert torch.equal(augment_colours(pictures, plain, draws), pictures)
+    changed = augment_colours(pictures, replace(RECIPE, jitter=0.9, noise=0.3), draws)
     assert 0 <= float(changed.min()) <= float(changed.max()) <= 1
     assert not torch.equal(changed, pictures)
 
@@ -581,4 +581,4 @@ def test_a_recipe_that_is_unknown_or_wrong_is_one_line() -> None:
 
 def test_changed_values_are_read_as_they_are_written() -> None:
     changes = (("weigh", {"depth": 4.0, "dir": 1.5}), ("zoom", (0.8, 1.3)), ("lr", 1e-4), ("compile", True))
-    assert parse_changes(set_words(changes)[1::2]) == changes
+    assert parse_changes(command_line_changes(changes)[1::2]) == changes

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssad.core.detections import Truth
 from ssad.training.batches import make_batch
-from ssad.training.loop import Step, harden, train
+from ssad.training.loop import TrainingStep, perturb_images, train
 
 HARD = replace(RECIPE, radius=4.0, attack_steps=1, amp=False)
 
@@ -26,8 +26,8 @@ def batch() -> tuple[Tensor, list[Truth]]:
 def test_pictures_get_harder_within_the_radius(steps: int) -> None:
     detector = fresh().requires_grad_(True).train()
     before = {name: value.clone() for name, value in detector.state_dict().items()}
-    step, (images, truth) = Step(detector, amp=False), batch()
-    found = harden(step, images, truth, replace(HARD, attack_steps=steps), key=(1,))
+    step, (images, truth) = TrainingStep(detector, amp=False), batch()
+    found = perturb_images(step, images, truth, replace(HARD, attack_steps=steps), key=(1,))
     assert 3 / 255 < float((found - images).abs().max()) <= 4 / 255 + 1e-6
     assert float(found.min()) >= 0
     assert float(found.max()) <= 1
@@ -45,8 +45,8 @@ def test_pictures_get_harder_within_the_radius(steps: int) -> None:
 
 
 def test_the_key_decides_the_start() -> None:
-    step, (images, truth) = Step(fresh(), amp=False), batch()
-    one, two, other = (harden(step, images, truth, HARD, key=(k,)) for k in (1, 1, 2))
+    step, (images, truth) = TrainingStep(fresh(), amp=False), batch()
+    one, two, other = (perturb_images(step, images, truth, HARD, key=(k,)) for k in (1, 1, 2))
     assert torch.equal(one, two)
     assert not torch.equal(one, other)
 

@@ -185,9 +185,9 @@ def test_on_the_road_is_what_the_query_says(field: RoadField) -> None:
     nearest = LaneQuery(graph).nearest(points)
     gap = field(torch.from_numpy(points).double()).numpy()
     sure = np.abs(gap) > 1e-4
-    assert ((gap <= 0) == nearest.inside)[sure].all()
+    assert ((gap <= 0) == nearest.is_inside)[sure].all()
     assert sure.mean() > 0.99
-    assert 0.1 < nearest.inside.mean() < 0.9
+    assert 0.1 < nearest.is_inside.mean() < 0.9
 
 
 def test_distance_from_the_road_has_a_gradient_and_reaches_far(field: RoadField) -> None:

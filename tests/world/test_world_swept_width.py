@@ -12,7 +12,7 @@ from helpers.quick import others_slow
 from benchmarks.traffic import town_routes, traffic
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Pose, Route
-from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.world.roads import load_town
 from ssad.world.roads.library import BUILT_IN
 from ssad.world.world import World
@@ -59,8 +59,8 @@ def test_long_vehicles_pass_who_waits_on_the_oncoming_lanes(town: str, body: str
     """
     graph = load_town(town)
     ways = town_routes(graph, 60, 400.0)  # in Oldmarket, no bus is given one
-    given = [route for route in ways if fits(body, route)][:8]
-    tight = [route for route in ways if not fits(body, route)][:8]
+    given = [route for route in ways if fits_route(body, route)][:8]
+    tight = [route for route in ways if not fits_route(body, route)][:8]
     others = ("car", "bus") if town == "Twinford" else ("car",)
     world = World(drives(graph, given + tight, body, others), {graph.name: graph})
     touched = np.zeros(world.batch, bool)

@@ -185,7 +185,7 @@ def record(
     from rich.console import Console
 
     from ssad.core.machine import pick_device
-    from ssad.engine.progress import Live
+    from ssad.engine.progress import LiveProgress
     from ssad.recorders.nuscenes import Recording, record_nuscenes
 
     def names(text: str) -> tuple[str, ...]:
@@ -198,9 +198,9 @@ def record(
         if parameter_source is not None and parameter_source.name == "COMMANDLINE":
             raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
     unit = "parts" if clips is not None else "scenes"
-    with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
+    with LiveProgress("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
-            from ssad.recorders.target_images import record_clips
+            from ssad.recorders.target_images import record_target_images
             from ssad.recorders.target_recording import TargetRecording, pair_images
             from ssad.rendering.target import parse_target
 
@@ -215,7 +215,7 @@ def record(
                 device=pick_device(device),
                 streets=streets,
             )
-            record_clips(target_recording, workers=workers, ray=ray, progress=progress.show)
+            record_target_images(target_recording, workers=workers, ray=ray, progress=progress.show)
             message = (
                 f"{out}: {sum(image_count for _, image_count in images_per_town)} images, "
                 f"annotations train.json, test.json and all.json"

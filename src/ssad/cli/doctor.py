@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import ssad
 from ssad.core.errors import EXTRA_OF, SSADError, install_extra
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ def _warp() -> Iterator[Finding]:
     try:
         import warp
 
-        from ssad.core.machine import quiet_warp
+        from ssad.core.machine import start_warp_quietly
 
-        quiet_warp()
+        start_warp_quietly()
         devices = ", ".join(f"{device.alias} ({device.name})" for device in warp.get_devices())
         yield Finding("warp", "ok", f"{version('warp-lang')}: {devices}")
         has_cuda = warp.is_cuda_available()
@@ -106,7 +106,7 @@ def _carla() -> Finding:
 
 
 def _home() -> Finding:
-    folder = home()
+    folder = home_folder()
     existing_folder = folder
     # The folder is created on first use: the nearest existing parent decides whether it can be.
     while not existing_folder.exists() and existing_folder != existing_folder.parent:

@@ -25,10 +25,10 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
-    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
-    attacks, attack_cell = shown_by(folder, cell)
+    attacks, attack_cell = attacks_and_cell(folder, cell)
     for path in export_shown_texture(attacks, attack_cell.spec, out, name=attack_cell.name, dots=dots):
         print(path)
 
@@ -41,10 +41,10 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and the picture that a projector shows."""
-    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
-    attacks, attack_cell = shown_by(folder, cell)
+    attacks, attack_cell = attacks_and_cell(folder, cell)
     for path in export_shown_light(attacks, attack_cell.spec, out, name=attack_cell.name):
         print(path)
 
@@ -56,14 +56,14 @@ def import_map(
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
 ) -> None:
     """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
 
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
-    path = bake(file, town_name, home())
+    path = bake(file, town_name, home_folder())
     print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
 
 
@@ -74,7 +74,7 @@ def import_routes(
     name: Annotated[str | None, typer.Option(help="Name of the set.  [default: name of the folder]")] = None,
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
@@ -86,8 +86,8 @@ def import_routes(
     if set_name in BUILT_IN_SETS:
         raise ConfigError(f"'{set_name}' is a built-in set; choose another name with --name")
     left_out: list[str] = []
-    scenarios = read(folder, left_out=left_out)
-    path = home() / "scenarios" / f"{set_name}.yaml"
+    scenarios = read(folder, omissions=left_out)
+    path = home_folder() / "scenarios" / f"{set_name}.yaml"
     save_scenarios(path, scenarios)
     towns = sorted({scenario.town for scenario in scenarios})
     print(f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
@@ -121,10 +121,10 @@ def import_drive(
     with NuScenes(root, version) as data:
         imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
     town = imported_drive.scenario.town
-    if not imported_drive.known:
+    if not imported_drive.is_known_town:
         store_town(imported_drive.graph, town, beside=out)
     save_scenarios(out, imported_drive.scenario)
-    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.left_out.items()))
+    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.omissions.items()))
     print(
         f"scenario {imported_drive.scenario.name}: {len(imported_drive.scenario.actors)} actors in {town}"
         f"{f'; left out: {omissions}' if omissions else ''}; written to {out}"

@@ -92,7 +92,7 @@ def import_openscenario(
     save_scenarios(out, imported.scenario)
     scenario = imported.scenario
     print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
-    print_counted("not carried over", imported.lost)
+    print_counted("not carried over", imported.omissions)
 
 
 def import_leaderboard(
@@ -132,11 +132,11 @@ def import_commonroad(
     check_yaml(out)
     imported = read_commonroad(file, town=out.stem, map_name=on)
     town = imported.scenario.town
-    if not imported.known:
+    if not imported.is_known_town:
         store_town(imported.graph, town, beside=out)
     save_scenarios(out, imported.scenario)
     print(f"scenario {imported.scenario.name}: {len(imported.scenario.actors)} actors in {town}; written to {out}")
-    print_counted("not carried over", imported.lost)
+    print_counted("not carried over", imported.omissions)
 
 
 def import_scenic(
@@ -171,7 +171,7 @@ def import_scenic(
             failures.append(str(error))
             continue
         sampled.append(program_sample.scenario)
-        omissions += program_sample.lost
+        omissions += program_sample.omissions
     if not sampled:
         raise ConfigError(failures[0])
     save_scenarios(out, sampled)
@@ -193,14 +193,14 @@ def store_town(graph: LaneGraph, town: str, *, beside: Path) -> None:
         ConfigError: A built-in town has this name.
     """
     from ssad.core.lane_graph import save_graph
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map, town_names
 
     if town_names().get(town) == "built-in":
         raise ConfigError(f"'{town}' is a built-in town; choose another name for {beside}")
     path = beside.with_suffix(".npz")
     save_graph(graph, path)
-    import_map(path, town, home())
+    import_map(path, town, home_folder())
 
 
 def print_counted(heading: str, lines: Sequence[str]) -> None:

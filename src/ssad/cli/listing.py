@@ -125,13 +125,15 @@ def _detector_list() -> dict[str, str]:
 
 def _recipe_list() -> dict[str, str]:
     from ssad.training.recipe import RECIPES
-    from ssad.training.reinforcement import LEARNINGS
+    from ssad.training.reinforcement import POLICY_RECIPES
 
     detectors = {
         name: f"{recipe.detector}: {recipe.epochs} epochs, batch {recipe.batch}, {recipe.optimizer}, lr {recipe.lr:g}"
         for name, recipe in RECIPES.items()
     }
-    return detectors | {name: f"driver: {recipe.steps:,} steps, lr {recipe.lr:g}" for name, recipe in LEARNINGS.items()}
+    return detectors | {
+        name: f"driver: {recipe.steps:,} steps, lr {recipe.lr:g}" for name, recipe in POLICY_RECIPES.items()
+    }
 
 
 LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {

@@ -41,7 +41,7 @@ def detect(
     from ssad.core.machine import pick_device
     from ssad.detectors import make_detector
     from ssad.detectors.detect import detect_dataset, detect_images, is_dataset
-    from ssad.engine.progress import Live
+    from ssad.engine.progress import LiveProgress
 
     folders = [source for source in sources if is_dataset(source)]
     if folders and len(sources) > 1:
@@ -69,7 +69,10 @@ def detect(
 
     root = folders[0]
     manifest = "clean" if read_manifest(root) is None else manifest_digest(root)
-    with NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
+    with (
+        NuScenes(root, version) as data,
+        LiveProgress("detect", 1, 0, console=Console(stderr=True), unit="scenes") as progress,
+    ):
         path, samples, boxes = detect_dataset(
             network, data, out, split=split, manifest=manifest, device=compute_device, progress=progress.show
         )
@@ -92,11 +95,11 @@ def show(
 
     from ssad.datasets.browse import check_scenes, write_page
     from ssad.datasets.nuscenes.reader import NuScenes
-    from ssad.engine.progress import Live
+    from ssad.engine.progress import LiveProgress
 
     names = [name.strip() for name in scenes.split(",") if name.strip()]
     with NuScenes(root, version) as data:
         check_scenes(data, names)
-        with Live("show", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
+        with LiveProgress("show", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
             page = write_page(data, out, scenes=names, moments=samples, progress=progress.show)
     print(f"page: {page}")

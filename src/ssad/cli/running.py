@@ -75,9 +75,9 @@ def run(
     folder = out or Path("runs") / plan.suite.name
     if dry_run:
         from ssad.cli.forecast import forecast
-        from ssad.engine.run import slice_of
+        from ssad.engine.run import select_cells
 
-        sliced_plan = replace(plan, cells=tuple(slice_of(plan, _selections(only or []))))
+        sliced_plan = replace(plan, cells=tuple(select_cells(plan, _selections(only or []))))
         for line in forecast(sliced_plan, folder, Resources(workers, ray, plan.device), sample=sample):
             print(line)
         return
@@ -219,9 +219,9 @@ def replay(
 
     write_film = _film(wear, wearer, detector)  # wrong options fail before the drive, which takes minutes
     if mcap:
-        from ssad.experiments.gap.mcap import need_mcap, write_mcap
+        from ssad.experiments.gap.mcap import require_mcap, write_mcap
 
-        need_mcap()
+        require_mcap()
     replayed = run_again(folder, cell)
     stem = make_folder(out or folder / "replays") / replayed.cell.key
     verdict = f"differs: {replayed.difference}" if replayed.difference else "identical"
@@ -248,7 +248,7 @@ def replay(
             stem.with_suffix(".mcap"),
             replayed.trace,
             replayed.graph,
-            recorded_drive=replayed.seen,
+            recorded_drive=replayed.perception,
             top_views=top_view_frames,
         )
         print(f"mcap: {path}")
@@ -268,7 +268,7 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
             raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
         return None
     from ssad.detectors import make_detector
-    from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
+    from ssad.experiments.driving.attacked_film import agent_ahead, attacked_frames
     from ssad.rendering.hours import at_hour
     from ssad.rendering.onboard import DAY
     from ssad.report.video import save_frames
@@ -278,7 +278,7 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
     target_kind = attack.live(1).kind
 
     def film(trace: Any, graph: Any, path: Path) -> Path:
-        agent = first_ahead(trace, target_kind) if wearer is None else wearer
+        agent = agent_ahead(trace, target_kind) if wearer is None else wearer
         if agent is None:
             kind_name = target_kind.name.lower()
             raise ConfigError(

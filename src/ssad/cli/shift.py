@@ -13,12 +13,12 @@ from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 from ssad.recorders.shifted.contact_sheet import parse_box, write_sheets
 from ssad.recorders.shifted.image_folder import picture_shifts, shift_pictures
 from ssad.recorders.shifted.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
 from ssad.recorders.shifted.options import SUBSAMPLING, Options, Strength
-from ssad.recorders.shifted.write import materialise
+from ssad.recorders.shifted.write import write_shifted_roots
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 
 
@@ -76,17 +76,17 @@ def shift_folder(
         version: Version of the dataset; None: the only one.
         split: Split whose scenes are written; None: no split.
         scenes: Names of the scenes.
-        workers: See `materialise`.
-        ray: See `materialise`.
+        workers: See `write_shifted_roots`.
+        ray: See `write_shifted_roots`.
         settings: Further fields of `Options`.
 
     Returns:
         The exit code.
 
     Raises:
-        ConfigError: See `materialise`.
-        FormatError: See `materialise`.
-        StoreError: See `materialise`.
+        ConfigError: See `write_shifted_roots`.
+        FormatError: See `write_shifted_roots`.
+        StoreError: See `write_shifted_roots`.
     """
     with NuScenes(source, version) as data:
         scene_names = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())
@@ -101,8 +101,8 @@ def shift_folder(
                 )
     options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=scene_names, **settings)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
-            roots = materialise(options, workers=workers, ray=ray, progress=display.show)
+        with LiveProgress("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
+            roots = write_shifted_roots(options, workers=workers, ray=ray, progress=display.show)
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130
@@ -157,7 +157,7 @@ def shift_picture_folder(
         raise unknown_name("subsampling", settings["subsampling"], SUBSAMPLING)
     possible_shifts, strengths = picture_shifts(shift_names(shifts)), severities(severity)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as display:
+        with LiveProgress("shift", 1, 0, console=Console(stderr=True), unit="pictures") as display:
             folders = shift_pictures(
                 source,
                 out,

@@ -89,7 +89,7 @@ class TrackedBoxes(WorldBoxes):
         return TrackedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), (), np.zeros(0))
 
 
-def hulls(corners: F64, intrinsic: F64, image_size: tuple[int, int]) -> F64:
+def image_rectangles(corners: F64, intrinsic: F64, image_size: tuple[int, int]) -> F64:
     """Return the image rectangles around the corners of 3D boxes, cut at the border of the image.
 
     Args:

@@ -90,7 +90,7 @@ def load_weights(path: str | Path) -> dict[str, Tensor]:
     """
     source = Path(path).expanduser()
     if source.suffix in PICKLED and source.is_file():
-        return _unwrapped(read_pickled(source))
+        return _strip_prefixes(read_pickled(source))
     weights_files = _parts(source)
     state: dict[str, Tensor] = {}
     for weights_file in weights_files:
@@ -103,10 +103,10 @@ def load_weights(path: str | Path) -> dict[str, Tensor]:
         state |= tensors
     if not state:
         raise FormatError(f"{source}: holds no tensors")
-    return _unwrapped(state)
+    return _strip_prefixes(state)
 
 
-def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
+def _strip_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """Remove the prefixes that parallel training adds to all names."""
     while state and all(name.startswith("module.") for name in state):
         state = {name.removeprefix("module."): value for name, value in state.items()}
@@ -138,7 +138,7 @@ def _parts(path: Path) -> list[Path]:
             }
         )
         if len(indices) == 1 and not single_files:
-            return _indexed(indices[0])
+            return _read_shard_index(indices[0])
         if len(single_files) + len(shard_stems) == 1 and not indices:
             return single_files or _shards(path, shard_stems[0])
         pickle_files = sorted(candidate for candidate in path.iterdir() if candidate.suffix in PICKLED)
@@ -148,7 +148,7 @@ def _parts(path: Path) -> list[Path]:
             f"{path}: {len(single_files) + len(shard_stems) or 'no'} sets of weights there; name one file"
         )
     if path.name.endswith(".index.json"):
-        return _indexed(path)
+        return _read_shard_index(path)
     shard = SHARD.fullmatch(path.name)
     if shard:
         return _shards(path.parent, shard["stem"])
@@ -167,7 +167,7 @@ def _names(folder: Path) -> list[str]:
     return [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
 
 
-def _indexed(index: Path) -> list[Path]:
+def _read_shard_index(index: Path) -> list[Path]:
     """Return the files named by an index of other tools (weight_map)."""
     content = read_json(index)
     weight_map = content.get("weight_map") if isinstance(content, dict) else None
@@ -292,7 +292,7 @@ def save_weights(
     if not state:
         raise ConfigError(f"{target}: no tensors to write")
     check_finite(state, str(target))
-    stored = {name: _stored(value, half=half) for name, value in sorted(state.items())}
+    stored = {name: _convert_for_storage(value, half=half) for name, value in sorted(state.items())}
     card = replace(card, hash=hash_state(stored), version=card.version or __version__)
     card_text = _card_text(card, str(target))
     groups = _groups(stored, limit=int(shard_mb * 1e6))
@@ -323,7 +323,7 @@ def _card_text(card: WeightsCard, origin: str) -> str:
         raise ConfigError(f"{origin}: the card holds what JSON cannot: {error}") from None
 
 
-def _stored(value: Tensor, *, half: bool) -> Tensor:
+def _convert_for_storage(value: Tensor, *, half: bool) -> Tensor:
     value = value.detach().cpu().contiguous()
     if half and value.is_floating_point() and value.ndim > 1 and float(value.abs().max()) <= HALF_MAX:
         return value.half()
@@ -382,7 +382,7 @@ def check_finite(state: Mapping[str, Tensor], origin: str) -> None:
             raise FormatError(f"{origin}: '{name}' holds {invalid_count} NaN or infinite values of {value.numel()}")
 
 
-def fit_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> None:
+def copy_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> None:
     """Copy weights into a module of the same names and shapes; on an error the module stays unchanged.
 
     Values are cast to the module's types. Missing counters of BatchNorm's steps are accepted.
@@ -401,7 +401,7 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path
     missing = [key for key in parameters if key not in state and not key.endswith(COUNTER)]
     unexpected = [key for key in state if key not in parameters]
     if missing or unexpected:
-        problems = [_listed("missing", missing, unexpected), _listed("foreign", unexpected, missing)]
+        problems = [_describe_keys("missing", missing, unexpected), _describe_keys("foreign", unexpected, missing)]
         raise FormatError(
             f"{origin}: these are not the weights of {name}: {'; '.join(problem for problem in problems if problem)} "
             f"(of {len(parameters)} names {sum(key in state for key in parameters)} fit)"
@@ -412,7 +412,7 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path
         if tensor.shape != parameters[key].shape
     }
     for key, (source_shape, target_shape) in shape_differences.items():
-        reason = _other_shapes(module, shape_differences.values())
+        reason = _explain_shape_mismatch(module, shape_differences.values())
         raise FormatError(
             f"{origin}: '{key}' has the shape {list(source_shape)}, {name} takes {list(target_shape)}: {reason}"
         )
@@ -426,7 +426,7 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path
             parameters[key].copy_(value)
 
 
-def start_from(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> list[str]:
+def copy_matching_weights(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> list[str]:
     """Copy the weights that fit into a module as a start of training; layers of another shape or name stay fresh.
 
     Args:
@@ -445,13 +445,13 @@ def start_from(module: nn.Module, state: Mapping[str, Tensor], origin: str | Pat
         key: value for key, value in state.items() if key in fresh_state and fresh_state[key].shape == value.shape
     }
     if len(shared_weights) < 0.8 * len(fresh_state):
-        fit_state(module, state, origin)  # raises an error that lists the differences
+        copy_state(module, state, origin)  # raises an error that lists the differences
     else:
-        fit_state(module, {**fresh_state, **shared_weights}, origin)
+        copy_state(module, {**fresh_state, **shared_weights}, origin)
     return [key for key in fresh_state if key not in shared_weights and not key.endswith(COUNTER)]
 
 
-def _listed(relation: str, keys: list[str], other_keys: Iterable[str]) -> str:
+def _describe_keys(relation: str, keys: list[str], other_keys: Iterable[str]) -> str:
     if not keys:
         return ""
     close_matches = difflib.get_close_matches(keys[0], list(other_keys)[:2000], n=1, cutoff=0.5)
@@ -463,7 +463,7 @@ def _listed(relation: str, keys: list[str], other_keys: Iterable[str]) -> str:
 Shape = tuple[int, ...]
 
 
-def _other_shapes(module: nn.Module, shape_pairs: Iterable[tuple[Shape, Shape]]) -> str:
+def _explain_shape_mismatch(module: nn.Module, shape_pairs: Iterable[tuple[Shape, Shape]]) -> str:
     """A guess at why shapes (given, taken) differ: another number of classes if that explains all, or another width."""
     classes = len(getattr(module, "classes", ()))
     possible_counts: set[int] | None = None

@@ -128,10 +128,10 @@ def _cpu(parts: Sequence[Tensor]) -> Sequence[Tensor]:
 
     if not all(isinstance(part, torch.Tensor) for part in parts):
         raise ConfigError("broken promise: Detections holds tensors")
-    return parts if all(part.device.type == "cpu" for part in parts) else together(parts, torch.Tensor.cpu)
+    return parts if all(part.device.type == "cpu" for part in parts) else transform_together(parts, torch.Tensor.cpu)
 
 
-def together(parts: Sequence[Tensor], transform: Callable[[Tensor], Tensor]) -> list[Tensor]:
+def transform_together(parts: Sequence[Tensor], transform: Callable[[Tensor], Tensor]) -> list[Tensor]:
     """Return the changed parts [N, ...], all changed in one call where they are of a kind.
 
     Args:

@@ -207,7 +207,7 @@ class Belief:
             the next junction (0 inside; 1e6: none), its turn there (0 straight, 1 right, 2 left; 3 more with a
             stop or yield sign), and m until its path leaves the straight line along its heading.
         line_signal: [B, K] signal of the stop line before it, -1 none.
-        stood: [B, K] s that it has been at rest while wanting to go. None: derived from earlier beliefs with an
+        standing_time: [B, K] s that it has been at rest while wanting to go. None: derived from earlier beliefs with an
             object at rest in its place.
         gives_way: [B, K] whether it is expected to give way to those with priority.
         change: [B, K, 2] turn signal of a lane change (1 left, -1 right, 0 none), and 1 while it overtakes on an
@@ -227,7 +227,7 @@ class Belief:
     forecast: F32 | None = None
     way: F32 | None = None
     line_signal: I32 | None = None
-    stood: F32 | None = None
+    standing_time: F32 | None = None
     gives_way: Bool | None = None
     change: I32 | None = None
     height: F32 | None = None

@@ -9,7 +9,7 @@ from torch import nn
 
 
 @contextmanager
-def evaluating(module: nn.Module) -> Iterator[None]:
+def in_eval_mode(module: nn.Module) -> Iterator[None]:
     """Set all submodules to eval mode within the block, and restore the mode of each afterwards."""
     # Each submodule by itself: frozen norms of a network in training are in eval mode already.
     modes = [(submodule, submodule.training) for submodule in module.modules()]

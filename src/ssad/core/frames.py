@@ -126,7 +126,7 @@ class SceneContext:
 
 
 @dataclass(frozen=True, slots=True)
-class Applied:
+class ShiftReport:
     """Result of a shift on one file: applied or not, its parameters (plain data), and skipped parts with counts."""
 
     applied: bool

@@ -103,7 +103,7 @@ class Outcome:
     within_limits: bool | None = None
 
     @property
-    def valid(self) -> bool:
+    def is_valid(self) -> bool:
         """True if the ego touched an adversary that stayed on the road and hit no other agent."""
         return self.collision and not self.off_road and not self.hit_others
 
@@ -115,7 +115,7 @@ class Outcome:
         tenth of the impact speed in m/s, but one off the road or with further agents counts as a gap of 1 m.
         """
         if self.collision:
-            return 0.1 * (self.impact_speed or 0.0) if self.valid else -1.0
+            return 0.1 * (self.impact_speed or 0.0) if self.is_valid else -1.0
         return -100.0 if self.gap is None else max(-self.gap, -100.0)
 
 

@@ -74,7 +74,7 @@ def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
     one_local = to_local(second[..., None, :3], first_corners)
     half_first, half_second = 0.5 * first[..., None, 3:5], 0.5 * second[..., None, 3:5]
     distance = np.minimum(_point_to_box(two_local, half_first), _point_to_box(one_local, half_second))
-    is_separated = _separated(two_local, half_first) | _separated(one_local, half_second)
+    is_separated = _is_separated(two_local, half_first) | _is_separated(one_local, half_second)
     return np.where(is_separated, distance, 0.0).astype(distance.dtype)
 
 
@@ -94,7 +94,7 @@ def _point_to_box(points: Floats, half_size: Floats) -> Floats:
     return np.asarray(np.hypot(excess[..., 0], excess[..., 1]).min(axis=-1))
 
 
-def _separated(points: Floats, half_size: Floats) -> npt.NDArray[np.bool_]:
+def _is_separated(points: Floats, half_size: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an axis of the box at the origin separates it from the hull of the points."""
     lower, upper = points.min(axis=-2), points.max(axis=-2)
     extent = half_size[..., 0, :]

@@ -16,7 +16,7 @@ from ssad.core.types import U8
 
 MAX_PIXELS = 1 << 26
 _PNG = b"\x89PNG\r\n\x1a\n"
-BAND = 26  # pixels
+CAPTION_HEIGHT = 26  # pixels
 
 
 def read_image(path: str | Path) -> U8:
@@ -91,11 +91,11 @@ def encode_jpeg(image: U8, quality: int = 95, subsampling: str = "420") -> bytes
     return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality, "RGB", subsampling, fastdct=False))
 
 
-def captioned(image: U8, caption: str, width: int) -> U8:
+def add_caption(image: U8, caption: str, width: int) -> U8:
     """Return an image of the given width with its caption below."""
     height = round(image.shape[0] * width / image.shape[1])
     resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    caption_band = np.full((BAND, width, 3), 255, np.uint8)
+    caption_band = np.full((CAPTION_HEIGHT, width, 3), 255, np.uint8)
     scale = 0.5
     # Long captions shrink until they fit, but stay legible.
     while scale > 0.25 and cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width - 12:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError, MapError
-from ssad.core.rotations import wrap, wrap_angle
+from ssad.core.rotations import wrap_angle, wrap_scalar
 from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
@@ -137,16 +137,16 @@ class LaneGraph:
             object.__setattr__(self, name, value)
         _check(self)
         length = self.s[self.offset[1:] - 1]
-        predecessors = np.repeat(np.arange(self.lanes, dtype=np.int32), np.diff(self.succ_offset))
+        predecessors = np.repeat(np.arange(self.lane_count, dtype=np.int32), np.diff(self.succ_offset))
         by_successor = np.argsort(self.succ, kind="stable")
-        pred_counts = np.bincount(self.succ, minlength=self.lanes)
+        pred_counts = np.bincount(self.succ, minlength=self.lane_count)
         pred_offsets = np.concatenate([[0], np.cumsum(pred_counts)]).astype(np.int32)
         for name, value in (("length", length), ("pred", predecessors[by_successor]), ("pred_offset", pred_offsets)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
     @property
-    def lanes(self) -> int:
+    def lane_count(self) -> int:
         """Number of lanes L."""
         return len(self.kind)
 
@@ -188,7 +188,7 @@ class LaneGraph:
         )
         point_index += lane_points.start
         x, y = (1.0 - t) * self.xy[point_index] + t * self.xy[point_index + 1]
-        yaw_change = wrap(float(self.yaw[point_index + 1] - self.yaw[point_index]))
+        yaw_change = wrap_scalar(float(self.yaw[point_index + 1] - self.yaw[point_index]))
         width = (1.0 - t) * float(self.width[point_index]) + t * float(self.width[point_index + 1])
         return float(x), float(y), float(self.yaw[point_index]) + t * yaw_change, width
 
@@ -210,18 +210,18 @@ class LaneGraph:
         )
         return np.column_stack([xy, self.yaw[point_indices].astype(np.float64) + t * yaw_change, width])
 
-    def divided(self, lane: int) -> bool:
+    def is_divided(self, lane: int) -> bool:
         """Return whether no oncoming lane lies beside those of a lane's direction: a one-way road, or a median."""
-        while (left := int(self.left[lane])) >= 0 and self.same_direction(lane, left):
+        while (left := int(self.left[lane])) >= 0 and self.is_same_direction(lane, left):
             lane = left
         return left < 0 or self.kind[left] != LaneType.DRIVING
 
-    def same_direction(self, lane: int, other_lane: int) -> bool:
+    def is_same_direction(self, lane: int, other_lane: int) -> bool:
         """Return whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
         return bool(self.lane_id[lane] * self.lane_id[other_lane] > 0 and self.road[lane] == self.road[other_lane])
 
 
-def no_signals() -> dict[str, Any]:
+def empty_signal_arrays() -> dict[str, Any]:
     """Return the arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
     no_indices = np.zeros(0, np.int32)
     return {
@@ -347,7 +347,7 @@ def load_graph(path: Path | str) -> LaneGraph:
     return LaneGraph(name=str(header[1]), **arrays)
 
 
-def equal(first: LaneGraph, second: LaneGraph) -> bool:
+def are_equal(first: LaneGraph, second: LaneGraph) -> bool:
     """Return whether two graphs hold the same numbers."""
     return first.name == second.name and all(
         np.array_equal(getattr(first, graph_field.name), getattr(second, graph_field.name))

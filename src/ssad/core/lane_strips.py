@@ -32,12 +32,12 @@ class Strip:
     right: F64
 
     @property
-    def ring(self) -> F64:
+    def outline(self) -> F64:
         """The outline [N, 2] m."""
         return np.concatenate([self.left, self.right[::-1]])
 
 
-def strips(graph: LaneGraph) -> list[Strip]:
+def make_lane_strips(graph: LaneGraph) -> list[Strip]:
     """Return all lanes that are drawn, bottom layer first."""
     lane_strips = []
     for lane in range(len(graph.kind)):
@@ -50,7 +50,13 @@ def strips(graph: LaneGraph) -> list[Strip]:
         half_width = 0.5 * graph.width[lane_points, None]
         in_junction = bool(graph.junction[lane] >= 0)
         lane_strips.append(
-            Strip(lane, layer, in_junction, thin(xy + normal * half_width), thin(xy - normal * half_width))
+            Strip(
+                lane,
+                layer,
+                in_junction,
+                simplify_polyline(xy + normal * half_width),
+                simplify_polyline(xy - normal * half_width),
+            )
         )
     return sorted(lane_strips, key=lambda strip: strip.layer)
 
@@ -65,7 +71,7 @@ def junction_areas(graph: LaneGraph, lane_strips: Sequence[Strip], *, scale: flo
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(scale) | 1, int(scale) | 1))
     for junction in np.unique(graph.junction[graph.junction >= 0]):
         outlines = [
-            strip.ring
+            strip.outline
             for strip in lane_strips
             if graph.junction[strip.lane] == junction and strip.layer == LAYERS[LaneType.DRIVING]
         ]
@@ -81,12 +87,14 @@ def junction_areas(graph: LaneGraph, lane_strips: Sequence[Strip], *, scale: flo
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         areas += [
-            thin(contour[:, 0].astype(np.float64) / scale + origin, 0.15) for contour in contours if len(contour) > 8
+            simplify_polyline(contour[:, 0].astype(np.float64) / scale + origin, 0.15)
+            for contour in contours
+            if len(contour) > 8
         ]
     return areas
 
 
-def thin(xy: F64, tolerance: float = 0.04) -> F64:
+def simplify_polyline(xy: F64, tolerance: float = 0.04) -> F64:
     """A polyline without the points that leave its shape within `tolerance` m (Douglas-Peucker)."""
     is_kept = np.zeros(len(xy), bool)
     is_kept[[0, -1]] = True

@@ -24,7 +24,7 @@ def cuda_driver() -> bool:
 
 
 @cache
-def quiet_warp() -> None:
+def start_warp_quietly() -> None:
     """Start Warp, once per process, without its banner and its notes about the kernel cache."""
     import warp
 
@@ -42,7 +42,7 @@ def quiet_warp() -> None:
         os.close(null_device)
 
 
-def keep_memory(size: int = 1 << 30) -> None:
+def retain_freed_memory(size: int = 1 << 30) -> None:
     """Let this process keep the memory of freed CPU tensors for reuse; takes effect only with glibc.
 
     By default, glibc returns large blocks to the system and requests them again, page by page, in each pass of a
@@ -66,7 +66,7 @@ def pick_device(requested: str) -> str:
     if cuda_driver():
         import warp
 
-        quiet_warp()
+        start_warp_quietly()
         if warp.is_cuda_available():
             return "cuda"
     if requested == "cuda":
@@ -90,7 +90,7 @@ def versions(device: str) -> dict[str, str]:
     return result
 
 
-def machine() -> dict[str, str]:
+def machine_properties() -> dict[str, str]:
     """Return the operating system, processor and core count of this machine; neither its name nor its user."""
     name = platform.processor()
     with contextlib.suppress(OSError):  # Linux names the processor here
@@ -111,7 +111,7 @@ def visible_gpus() -> list[str]:
         return [name.strip() for name in selection.split(",") if name.strip()]
     import warp
 
-    quiet_warp()
+    start_warp_quietly()
     return [str(index) for index in range(warp.get_cuda_device_count())]
 
 
@@ -125,6 +125,6 @@ def gpu_workers(gpus: int) -> int:
         return 0
     import warp
 
-    quiet_warp()
+    start_warp_quietly()
     memory = [device.total_memory for device in warp.get_cuda_devices()[:gpus]]
     return sum(max(1, min(GPU_WORKERS, size // GPU_SHARE)) for size in memory)

@@ -25,7 +25,7 @@ class Objects:
     Attributes:
         scene: [M] index of the scene.
         place: [M, 2] x, y of the centre, m.
-        spread: [M, 2, 2] covariance of the position, m^2.
+        covariance: [M, 2, 2] covariance of the position, m^2.
         yaw: [M] heading, rad; NaN where unknown.
         size: [M, 2] length and width, m.
         velocity: [M, 2] m/s; NaN where unknown.
@@ -35,7 +35,7 @@ class Objects:
 
     scene: I64
     place: F64
-    spread: F64
+    covariance: F64
     yaw: F64
     size: F64
     velocity: F64
@@ -102,7 +102,7 @@ def no_tracks() -> Tracks:
 
 
 @dataclass(frozen=True, eq=False)
-class Perceived:
+class DrivePerception:
     """Perception of a driver in one drive.
 
     Attributes:
@@ -112,7 +112,7 @@ class Perceived:
         signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
     """
 
-    looks: Sequence[tuple[float, Objects | None]]
-    known: Sequence[tuple[float, Tracks]]
+    detections: Sequence[tuple[float, Objects | None]]
+    tracks: Sequence[tuple[float, Tracks]]
     cameras: Mapping[str, Camera]
     signs: Sequence[tuple[float, F64]] = ()

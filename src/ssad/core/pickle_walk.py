@@ -26,7 +26,7 @@ class RefusedError(Exception):
     """A file requests something that no weights need."""
 
 
-class Steps:
+class StepBudget:
     """Budget of work that a file may still request."""
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Steps:
             raise RefusedError(f"its pickle takes more than {MAX_STEPS:,} steps to read, far more than weights do")
 
 
-def walk(file: io.BytesIO, file_name: str, steps: Steps) -> None:
+def walk(file: io.BytesIO, file_name: str, steps: StepBudget) -> None:
     """Follow the pickle that starts here, and restore the position of the file.
 
     A value costs one step plus the steps of all its parts, so shared parts count each time: small tuples of

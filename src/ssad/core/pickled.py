@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.errors import FormatError
-from ssad.core.pickle_walk import RefusedError, Steps, walk
+from ssad.core.pickle_walk import RefusedError, StepBudget, walk
 from ssad.core.safeio import MIB, read_bytes
 
 MAX_BYTES = 4096 * MIB
@@ -64,7 +64,7 @@ class _Storage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Strided:
+class _StridedTensor:
     """A tensor to be: a window of a storage. Nothing in it is trusted before `_TensorReader.tensor`."""
 
     storage: Any
@@ -74,10 +74,10 @@ class _Strided:
     kind: Any = None
 
 
-class _Inert:
+class _InertObject:
     """Placeholder of an object whose class is not built: its arguments, state and items."""
 
-    def __new__(cls, *args: Any, **options: Any) -> _Inert:
+    def __new__(cls, *args: Any, **options: Any) -> _InertObject:
         self = super().__new__(cls)
         self.args, self.state, self.entries, self.list = args, None, {}, []
         return self
@@ -105,7 +105,7 @@ class _Inert:
         self.list.extend(values)
 
 
-class _Table(dict[Any, Any]):
+class _InertDict(dict[Any, Any]):
     """An OrderedDict of the file, without further attributes."""
 
     def __setstate__(self, state: Any) -> None:
@@ -117,7 +117,7 @@ class _Maker:
 
     __slots__ = ("_factory", "_steps")
 
-    def __init__(self, factory: Callable[..., Any], steps: Steps) -> None:
+    def __init__(self, factory: Callable[..., Any], steps: StepBudget) -> None:
         self._factory, self._steps = factory, steps
 
     def __call__(self, *args: Any) -> Any:
@@ -128,9 +128,9 @@ class _Maker:
         raise pickle.UnpicklingError("it changes a function")
 
 
-def _table(items: Any = ()) -> _Table:
+def _ordered_dict(items: Any = ()) -> _InertDict:
     """Return an OrderedDict from its items (as written by Python 2), without names that are not text."""
-    return _Table((name, value) for name, value in items if isinstance(name, str))
+    return _InertDict((name, value) for name, value in items if isinstance(name, str))
 
 
 def _size(lengths: Any = ()) -> tuple[int, ...]:
@@ -140,13 +140,13 @@ def _size(lengths: Any = ()) -> tuple[int, ...]:
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "collections.OrderedDict": _table,
+    "collections.OrderedDict": _ordered_dict,
     "torch.Size": _size,
-    "torch._utils._rebuild_tensor": _Strided,
-    "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _Strided(
+    "torch._utils._rebuild_tensor": _StridedTensor,
+    "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _StridedTensor(
         storage, offset, size, stride
     ),
-    "torch._utils._rebuild_tensor_v3": lambda storage, offset, size, stride, grad, hooks, kind, *_: _Strided(
+    "torch._utils._rebuild_tensor_v3": lambda storage, offset, size, stride, grad, hooks, kind, *_: _StridedTensor(
         storage, offset, size, stride, kind
     ),
     "torch._utils._rebuild_parameter": lambda data, *_: data,
@@ -159,7 +159,7 @@ class _Reader(pickle.Unpickler):
     """An unpickler that builds only tensor specifications, plain containers and inert records."""
 
     def __init__(self, file: io.BytesIO, file_name: str = "the file") -> None:
-        self.steps = Steps()
+        self.steps = StepBudget()
         walk(file, file_name, self.steps)
         super().__init__(file, encoding="utf-8")
         self.names: set[str] = set()
@@ -182,7 +182,7 @@ class _Reader(pickle.Unpickler):
         # One class for each name, so that a file cannot create them without limit.
         if full_name not in self.classes:
             self.steps.take(500)  # a class is far larger than its name
-            self.classes[full_name] = type(name, (_Inert,), {"__module__": module})
+            self.classes[full_name] = type(name, (_InertObject,), {"__module__": module})
         return self.classes[full_name]
 
     def persistent_load(self, pid: Any) -> Any:
@@ -206,7 +206,7 @@ class _TensorReader:
         self.storages: dict[str, Tensor] = {}
         self.remaining_bytes = min(MAX_EXPANSION * size, MAX_BYTES)
 
-    def tensor(self, view: _Strided) -> Tensor:
+    def tensor(self, view: _StridedTensor) -> Tensor:
         """The tensor, with storage of its own. ValueError: it does not lie within its storage."""
         storage = view.storage
         if not isinstance(storage, _Storage) or not isinstance(storage.kind, torch.dtype):
@@ -332,38 +332,42 @@ def _storages(tree: Any) -> Iterator[_Storage]:
         visited_ids.add(id(value))
         if isinstance(value, _Storage):
             yield value
-        elif isinstance(value, _Strided):
+        elif isinstance(value, _StridedTensor):
             stack.append(value.storage)
         elif isinstance(value, dict):
             stack += [*value.keys(), *value.values()]
         elif isinstance(value, (list, tuple, set)):
             stack += value
-        elif isinstance(value, _Inert):
+        elif isinstance(value, _InertObject):
             stack += [value.args, value.state, value.entries, value.list]
 
 
-def _mapping(value: Any) -> Mapping[Any, Any] | None:
+def _as_mapping(value: Any) -> Mapping[Any, Any] | None:
     if isinstance(value, dict):
         return value
-    if isinstance(value, _Inert) and value.entries:
+    if isinstance(value, _InertObject) and value.entries:
         return value.entries
     return None
 
 
-def _state(tree: Any, depth: int) -> list[tuple[str, _Strided]] | None:
+def _state(tree: Any, depth: int) -> list[tuple[str, _StridedTensor]] | None:
     """Return names and tensors of the first state dict in a tree, None if there is none."""
     if depth > 4:
         return None
-    if isinstance(tree, _Inert) and isinstance(tree.state, dict) and _mapping(tree.state.get("_modules")) is not None:
+    if (
+        isinstance(tree, _InertObject)
+        and isinstance(tree.state, dict)
+        and _as_mapping(tree.state.get("_modules")) is not None
+    ):
         return _module(tree)
-    mapping = _mapping(tree)
+    mapping = _as_mapping(tree)
     if mapping is None:
         inner_state = (
-            tree.state if isinstance(tree, _Inert) else None
+            tree.state if isinstance(tree, _InertObject) else None
         )  # an object that keeps a model, such as an average
         return _state(inner_state, depth + 1) if isinstance(inner_state, dict) else None
     named_tensors = [
-        (key, value) for key, value in mapping.items() if isinstance(key, str) and isinstance(value, _Strided)
+        (key, value) for key, value in mapping.items() if isinstance(key, str) and isinstance(value, _StridedTensor)
     ]
     if named_tensors:
         return named_tensors
@@ -374,9 +378,9 @@ def _state(tree: Any, depth: int) -> list[tuple[str, _Strided]] | None:
     return None
 
 
-def _module(root: _Inert) -> list[tuple[str, _Strided]]:
+def _module(root: _InertObject) -> list[tuple[str, _StridedTensor]]:
     """Return parameters and buffers of a pickled module and its submodules, by the names of its state dict."""
-    named_tensors: list[tuple[str, _Strided]] = []
+    named_tensors: list[tuple[str, _StridedTensor]] = []
     stack: list[tuple[str, Any, int]] = [("", root, 0)]
     module_count = 0
     while stack:
@@ -384,14 +388,14 @@ def _module(root: _Inert) -> list[tuple[str, _Strided]]:
         module_count += 1
         if depth > DEEPEST or module_count > MAX_STATE_ENTRIES:
             raise ValueError("a module nested without end")
-        state = module.state if isinstance(module, _Inert) and isinstance(module.state, dict) else {}
+        state = module.state if isinstance(module, _InertObject) and isinstance(module.state, dict) else {}
         for attribute in ("_parameters", "_buffers"):
-            for name, value in (_mapping(state.get(attribute)) or {}).items():
-                if isinstance(value, _Strided):
+            for name, value in (_as_mapping(state.get(attribute)) or {}).items():
+                if isinstance(value, _StridedTensor):
                     named_tensors.append((f"{prefix}{name}", value))
         children = [
             (f"{prefix}{child_name}.", child, depth + 1)
-            for child_name, child in (_mapping(state.get("_modules")) or {}).items()
+            for child_name, child in (_as_mapping(state.get("_modules")) or {}).items()
         ]
         stack += reversed(children)
     return named_tensors

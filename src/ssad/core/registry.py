@@ -37,7 +37,7 @@ class Reference:
     label: str
 
     @staticmethod
-    def of(text: str) -> Reference:
+    def parse(text: str) -> Reference:
         """Parse a reference.
 
         Args:
@@ -83,12 +83,12 @@ def label_of(text: str) -> str:
     """Return the name of a system in tables: its label, or the whole reference.
 
     Args:
-        text: As for `Reference.of`.
+        text: As for `Reference.parse`.
 
     Raises:
-        ConfigError: As for `Reference.of`.
+        ConfigError: As for `Reference.parse`.
     """
-    return Reference.of(text).label or text
+    return Reference.parse(text).label or text
 
 
 def split_weights(text: str) -> tuple[str, str]:
@@ -124,7 +124,7 @@ def check_arguments(
     Raises:
         ConfigError: It takes no such arguments, or needs more.
     """
-    options = {**Reference.of(reference).options, **(extra_arguments or {})}
+    options = {**Reference.parse(reference).options, **(extra_arguments or {})}
     if not options and not (is_instantiated and isinstance(target, type)):
         return
     if not callable(target):
@@ -233,7 +233,7 @@ def _import(kind: str, name: str, target: str) -> Any:
     try:
         value: Any = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a script that ends the process is no module
-        reason = describe(error) + _hint(error, module_name, working_folder)
+        reason = describe(error) + _import_hint(error, module_name, working_folder)
         raise ConfigError(f"{kind} '{name}': importing {module_name} failed: {reason}") from error
     for part in attribute.split("."):
         try:
@@ -271,7 +271,7 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}{f': {message}' if message else ''}{position}"
 
 
-def _hint(error: BaseException, module: str, folder: str) -> str:
+def _import_hint(error: BaseException, module: str, folder: str) -> str:
     if isinstance(error, ModuleNotFoundError) and error.name == module.split(".", maxsplit=1)[0]:
         return f"; looked in {folder} and the installed packages"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF:

@@ -120,7 +120,7 @@ def upright_poses(place: F64) -> F64:
     return pose
 
 
-def wrap(angle: float) -> float:
+def wrap_scalar(angle: float) -> float:
     """Wrap one angle into [-pi, pi), with the bits of `wrap_angle` in a tenth of its time."""
     wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
     return -math.pi if wrapped >= math.pi else wrapped

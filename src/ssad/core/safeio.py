@@ -33,7 +33,7 @@ MAX_ALIASED_NODES = 10_000
 Location = Sequence[str | int]
 
 
-def home() -> Path:
+def home_folder() -> Path:
     """Return the folder of imported towns and scenarios: $SSAD_HOME, else ~/.local/share/ssad (it need not exist)."""
     configured = os.environ.get("SSAD_HOME")
     return Path(configured).expanduser() if configured else Path.home() / ".local" / "share" / "ssad"
@@ -114,11 +114,11 @@ class Document:
 
     def error(self, location: Location, message: str) -> ConfigError:
         """Return a ConfigError that names file, line and key."""
-        key = dotted(location)
+        key = format_location(location)
         return ConfigError(f"{self.name}:{self.line(location)}: {f'{key}: ' if key else ''}{message}")
 
 
-def dotted(location: Location) -> str:
+def format_location(location: Location) -> str:
     """Return ("a", 0, "b") as `a[0].b`."""
     dotted_path = ""
     for part in location:
@@ -136,7 +136,7 @@ class _Builder:
         self.open_ids: set[int] = set()
         self.aliased = 0
 
-    def fail(self, node: Any, message: str) -> FormatError:
+    def error(self, node: Any, message: str) -> FormatError:
         return FormatError(f"{self.name}:{node.start_mark.line + 1}: {message}")
 
     def build(self, node: Any, location: tuple[str | int, ...], repeated: bool) -> Any:
@@ -145,11 +145,11 @@ class _Builder:
             # Nodes behind aliases are counted, because each use expands them again.
             self.aliased += 1
             if self.aliased > MAX_ALIASED_NODES:
-                raise self.fail(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
+                raise self.error(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
         if id(node) in self.open_ids:
-            raise self.fail(node, "an alias refers to the value that contains it")
+            raise self.error(node, "an alias refers to the value that contains it")
         if len(location) > MAX_DEPTH:
-            raise self.fail(node, f"nested deeper than {MAX_DEPTH} levels")
+            raise self.error(node, f"nested deeper than {MAX_DEPTH} levels")
         self.visited_ids.add(id(node))
         self.lines.setdefault(location, node.start_mark.line + 1)
         if node.id == "scalar":
@@ -158,7 +158,7 @@ class _Builder:
         try:
             if node.id == "sequence":
                 if node.tag != "tag:yaml.org,2002:seq":
-                    raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+                    raise self.error(node, f"tag {node.tag} is not allowed; use plain YAML")
                 return [self.build(child, (*location, index), repeated) for index, child in enumerate(node.value)]
             return self.mapping(node, location, repeated)
         finally:
@@ -166,16 +166,16 @@ class _Builder:
 
     def mapping(self, node: Any, location: tuple[str | int, ...], repeated: bool) -> dict[str, Any]:
         if node.tag != "tag:yaml.org,2002:map":
-            raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+            raise self.error(node, f"tag {node.tag} is not allowed; use plain YAML")
         entries: dict[str, Any] = {}
         for key_node, value_node in node.value:
             if key_node.id != "scalar":
-                raise self.fail(key_node, "a key must be a single word or text")
+                raise self.error(key_node, "a key must be a single word or text")
             if key_node.tag.endswith(":merge"):
-                raise self.fail(key_node, "merge keys (<<) are not supported; write the keys out")
+                raise self.error(key_node, "merge keys (<<) are not supported; write the keys out")
             key = str(key_node.value)
             if key in entries:
-                raise self.fail(key_node, f"key '{key}' appears twice")
+                raise self.error(key_node, f"key '{key}' appears twice")
             self.lines.setdefault((*location, key), key_node.start_mark.line + 1)
             entries[key] = self.build(value_node, (*location, key), repeated)
         return entries
@@ -193,13 +193,13 @@ class _Builder:
             if scalar_type == "float":
                 value = float(re.sub(r"\.(?=[in])", "", text.lower()))  # .inf and .nan have a leading dot
                 if math.isnan(value):
-                    raise self.fail(node, "NaN is not a value")
+                    raise self.error(node, "NaN is not a value")
                 return value
         except ValueError:
-            raise self.fail(node, f"'{text[:40]}' is not a valid {scalar_type}") from None
+            raise self.error(node, f"'{text[:40]}' is not a valid {scalar_type}") from None
         if scalar_type in ("str", "merge"):
             return text
-        raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+        raise self.error(node, f"tag {node.tag} is not allowed; use plain YAML")
 
 
 def parse_yaml_document(text: str, name: str = "<text>") -> Document:
@@ -266,7 +266,7 @@ def dump_yaml(data: Any) -> str:
 # ---------------------------------------------------------------- JSON, XML
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _refuse_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     mapping = dict(pairs)
     if len(mapping) != len(pairs):
         visited_keys: set[str] = set()
@@ -275,7 +275,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return mapping
 
 
-def _no_constant(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a JSON number")
 
 
@@ -286,7 +286,7 @@ def parse_json(text: str | bytes, name: str = "<text>") -> Any:
         FormatError: It is not valid JSON, with the line.
     """
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+        return json.loads(text, object_pairs_hook=_refuse_duplicate_keys, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         raise FormatError(f"{name}:{error.lineno}: not valid JSON: {error.msg}") from None
     except (ValueError, RecursionError) as error:
@@ -312,12 +312,12 @@ def dump_json(data: Any, *, indent: int | None = None) -> str:
     return json.dumps(data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
 
 
-def plain(value: Any) -> Any:
+def to_plain_json(value: Any) -> Any:
     """Return plain JSON data; a number that is not finite (no such event) becomes None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(element) for key, element in value.items()}
+        return {str(key): to_plain_json(element) for key, element in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(element) for element in value]
+        return [to_plain_json(element) for element in value]
     if hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

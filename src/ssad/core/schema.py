@@ -22,7 +22,7 @@ class Schema(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
-def _in_order(span: tuple[float, float]) -> tuple[float, float]:
+def _check_order(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] > span[1]:
         raise ValueError("the first is greater than the second")
     return span
@@ -38,11 +38,11 @@ Part = Annotated[Number, Field(ge=0.0, le=1.0)]
 Whole = Annotated[int, Field(strict=True, ge=1)]
 Two = Annotated[tuple[T, T], Field(strict=False)]
 """A pair, which is a list in YAML."""
-Span = Annotated[tuple[T, T], Field(strict=False), AfterValidator(_in_order)]
+Span = Annotated[tuple[T, T], Field(strict=False), AfterValidator(_check_order)]
 """The least and the greatest."""
 
 
-def checked(
+def build_validated(
     factory: Callable[..., T],
     values: Mapping[str, Any],
     *,

@@ -128,11 +128,11 @@ def _scan(path: Path) -> tuple[str, tuple[Import, ...], tuple[str, ...]]:
     """Return the hash of a file, its imports, and the modules that its strings name."""
     status = path.stat()
     # Time and size are part of the cache's key: an edited file is scanned again.
-    return _scanned(path, status.st_mtime_ns, status.st_size)
+    return _scan_cached(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4096)
-def _scanned(path: Path, _changed: int, _size: int) -> tuple[str, tuple[Import, ...], tuple[str, ...]]:
+def _scan_cached(path: Path, _changed: int, _size: int) -> tuple[str, tuple[Import, ...], tuple[str, ...]]:
     content = path.read_bytes()
     text = content.decode("utf-8", "replace")
     imports: list[Import] = []

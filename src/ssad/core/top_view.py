@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ssad.core.geometry import corners
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.lane_strips import LAYERS, junction_areas, strips
+from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips
 from ssad.core.types import AgentKind, Bool, LaneType
 
 Frame = npt.NDArray[np.uint8]
@@ -106,7 +106,7 @@ class TopView:
     """
 
     def __init__(self, graph: LaneGraph, *, size: tuple[int, int] = (960, 540), visible_width: float = 90.0) -> None:
-        self.lanes = strips(graph)
+        self.lanes = make_lane_strips(graph)
         self.areas = junction_areas(graph, self.lanes)
         self.size, self.scale = size, size[0] / visible_width
 
@@ -118,7 +118,7 @@ class TopView:
         for area in self.areas:
             canvas.fill(area, ROAD)
         for lane in self.lanes:
-            ring = lane.ring
+            ring = lane.outline
             lower, upper = ring.min(axis=0), ring.max(axis=0)
             if (lower > np.add(centre, view_radius)).any() or (upper < np.subtract(centre, view_radius)).any():
                 continue

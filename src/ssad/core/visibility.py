@@ -12,7 +12,7 @@ OCCLUDERS = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS)
 MIN_OCCLUDING_PROP = 0.8  # m, minimum extent of a prop in both directions to occlude
 
 
-def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
+def is_visible(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
     """Return which objects are visible.
 
     Args:
@@ -25,13 +25,13 @@ def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
     """
     half = 0.5 * belief.size
     cosine, sine = np.cos(belief.pose[..., 2]), np.sin(belief.pose[..., 2])
-    forward, aside = np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)
+    forward, lateral = np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)
     unit_points = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], np.float32)
     # [B, K, 5, 2]: the centre and the corners
     points = (
         belief.pose[..., None, :2]
         + (unit_points[:, 0] * half[..., :1])[..., None] * forward[..., None, :]
-        + (unit_points[:, 1] * half[..., 1:])[..., None] * aside[..., None, :]
+        + (unit_points[:, 1] * half[..., 1:])[..., None] * lateral[..., None, :]
     )
     present = belief.kind != AgentKind.NONE
     occludes = present & (
@@ -40,7 +40,7 @@ def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
     )
     unobstructed = np.hypot(*np.moveaxis(points - eye[:, None, None], -1, 0)) <= reach
     for occluder in np.flatnonzero(occludes.any(0)).tolist():
-        axes = np.stack([forward[:, occluder], aside[:, occluder]], 1)  # [B, 2, 2]
+        axes = np.stack([forward[:, occluder], lateral[:, occluder]], 1)  # [B, 2, 2]
         start = np.einsum("bij,bj->bi", axes, eye - belief.pose[:, occluder, :2])
         direction = (
             np.einsum("bij,bknj->bkni", axes, points - belief.pose[:, None, None, occluder, :2]) - start[:, None, None]
@@ -53,7 +53,7 @@ def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
         departure = np.maximum(first_hit, second_hit).min(-1)
         blocked = (entry < departure) & (departure > 0.0) & (entry < 1.0)
         blocked[:, occluder] = False
-        inside = (np.abs(start) <= half[:, occluder]).all(-1)  # an object at the viewpoint itself occludes nothing
-        unobstructed &= ~(blocked & (occludes[:, occluder] & ~inside)[:, None, None])
+        is_inside = (np.abs(start) <= half[:, occluder]).all(-1)  # an object at the viewpoint itself occludes nothing
+        unobstructed &= ~(blocked & (occludes[:, occluder] & ~is_inside)[:, None, None])
     visible: Bool = present & unobstructed.any(-1)
     return visible

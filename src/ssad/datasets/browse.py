@@ -88,7 +88,7 @@ def write_page(
     make_folder(out / "pictures")
     scene_entries = []
     for index, name in enumerate(names):
-        scene_entries.append(_scene(data.root, data.scene(name), out / "pictures", moments))
+        scene_entries.append(_write_scene(data.root, data.scene(name), out / "pictures", moments))
         progress(index + 1, len(names))
     page = (
         jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
@@ -107,7 +107,7 @@ def write_page(
     return out / "index.html"
 
 
-def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str, Any]:
+def _write_scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str, Any]:
     """Write the pictures of a scene, and return its entry of the page."""
     sample_indices = np.unique(
         np.linspace(0, len(scene.samples) - 1, min(moments, len(scene.samples))).round().astype(int)
@@ -127,12 +127,14 @@ def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str
         pictures = []
         for channel in [*ORDER, *sorted(set(frames) - set(ORDER))]:
             if channel in frames and frames[channel].modality == "camera":
-                pictures.append(_camera(root, frames[channel], boxes, folder / f"{file_stem}-{channel}.jpg"))
+                pictures.append(
+                    _write_camera_image(root, frames[channel], boxes, folder / f"{file_stem}-{channel}.jpg")
+                )
         lidar = next((frame for frame in frames.values() if frame.modality == "lidar"), None)
         view_name = ""
         if lidar is not None:
             view_name = f"{file_stem}-above.jpg"
-            save_picture(folder / view_name, from_above(root, lidar, boxes))
+            save_picture(folder / view_name, draw_top_view(root, lidar, boxes))
         seconds = (scene.samples[sample_index].timestamp - scene.samples[0].timestamp) / 1e6
         moment_entries.append(
             {"title": f"{seconds:.1f} s, {len(boxes)} boxes", "pictures": pictures, "above": view_name}
@@ -142,7 +144,7 @@ def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str
     return {"name": scene.record.name, "about": summary, "counts": counts.most_common(), "moments": moment_entries}
 
 
-def _camera(root: Path, frame: SensorFrame, annotations: Annotations, path: Path) -> dict[str, Any]:
+def _write_camera_image(root: Path, frame: SensorFrame, annotations: Annotations, path: Path) -> dict[str, Any]:
     """A picture with its boxes; one that cannot be read says why."""
     title = frame.channel
     try:
@@ -158,7 +160,7 @@ def _camera(root: Path, frame: SensorFrame, annotations: Annotations, path: Path
     return {"file": path.name, "title": title, "size": (canvas.shape[1], canvas.shape[0])}
 
 
-def from_above(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
+def draw_top_view(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
     """LiDAR points and boxes around the ego, which looks up; points are coloured by their height.
 
     Args:
@@ -178,7 +180,7 @@ def from_above(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
     points = points[(np.abs(points[:, :2]) < VIEW_RANGE).all(1)]
     height_levels = np.clip((points[:, 2] - MIN_HEIGHT) / (MAX_HEIGHT - MIN_HEIGHT), 0, 1) * 255
     if len(points):
-        pixels = np.clip(_pixels(points), 0, VIEW_SIZE - 1).astype(int)
+        pixels = np.clip(_to_pixels(points), 0, VIEW_SIZE - 1).astype(int)
         colours = cv2.applyColorMap(height_levels.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
         canvas[pixels[:, 1], pixels[:, 0]] = colours[:, 0, ::-1]
     world_to_ego = np.linalg.inv(lidar.ego_to_world)
@@ -190,7 +192,9 @@ def from_above(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
         corners = centres[:, None] + np.einsum("nij,nkj->nki", axes, corner_signs * half_size[:, None])
         front = centres + np.einsum("nij,nj->ni", axes, half_size * (1, 0, 0))
         # OpenCV takes fixed-point coordinates: 4 fractional bits, hence the factor 16.
-        for outline, centre_pixel, front_pixel in zip(_pixels(corners), _pixels(centres), _pixels(front), strict=True):
+        for outline, centre_pixel, front_pixel in zip(
+            _to_pixels(corners), _to_pixels(centres), _to_pixels(front), strict=True
+        ):
             cv2.polylines(canvas, [np.round(outline * 16).astype(np.int32)], True, BOX, 1, cv2.LINE_AA, 4)
             endpoints = [
                 tuple(int(coordinate) for coordinate in np.round(pixel * 16)) for pixel in (centre_pixel, front_pixel)
@@ -200,7 +204,7 @@ def from_above(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
     return canvas
 
 
-def _pixels(points: F64) -> F64:
+def _to_pixels(points: F64) -> F64:
     """Convert points of the ego frame (x forward, y left) to pixels (x forward is up)."""
     pixels = VIEW_SIZE / 2 - np.asarray(points)[..., :2] * (VIEW_SIZE / 2 / VIEW_RANGE)
     return np.asarray(pixels[..., ::-1], np.float64)

@@ -24,7 +24,7 @@ class CocoImage:
         file: Path of the picture.
         width: Width in pixels.
         height: Height in pixels.
-        about: All further keys of the picture in the file.
+        metadata: All further keys of the picture in the file.
         box: x1, y1, x2, y2 in pixels [N, 4].
         label: Index into the set's classes [N].
         crowd: Boxes that count neither as detected nor as missed [N].
@@ -34,7 +34,7 @@ class CocoImage:
     file: Path
     width: int
     height: int
-    about: Mapping[str, Any]
+    metadata: Mapping[str, Any]
     box: F64
     label: I32
     crowd: Bool
@@ -49,14 +49,16 @@ class CocoSet:
     images: tuple[CocoImage, ...]
 
 
-def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> dict[str, Any]:
+def coco_data(
+    classes: Sequence[str], images: Sequence[Mapping[str, Any]], metadata: Mapping[str, Any]
+) -> dict[str, Any]:
     """The content of an annotation file.
 
     Args:
         classes: Names, in the order of the labels.
         images: For each image file_name, width, height, anything else, and `objects`, each with label (index), box
             (x1, y1, x2, y2), pixels (area), crowd and anything else.
-        about: The `info` of the file.
+        metadata: The `info` of the file.
 
     Returns:
         What is to be written as JSON; ids start at 1.
@@ -82,7 +84,7 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
                 | extra
             )
     categories = [{"id": key + 1, "name": name, "supercategory": "road"} for key, name in enumerate(classes)]
-    return {"info": dict(about), "images": image_rows, "annotations": annotation_rows, "categories": categories}
+    return {"info": dict(metadata), "images": image_rows, "annotations": annotation_rows, "categories": categories}
 
 
 def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
@@ -119,7 +121,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
         # COCO ids may have gaps; labels count from 0 in the order of the ids.
         label_by_category = {category_id: key for key, category_id in enumerate(sorted(class_names))}
         pictures = tuple(
-            _image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
+            _parse_image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
             for record in content["images"]
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -127,7 +129,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
     return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
 
 
-def _image(
+def _parse_image(
     row: Mapping[str, Any], image_annotations: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
 ) -> CocoImage:
     """One picture with its annotations. ValueError, KeyError or TypeError: broken."""

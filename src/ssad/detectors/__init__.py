@@ -45,7 +45,7 @@ def make_detector(
         ConfigError: The builder refuses an option.
         FormatError: The weights cannot be read, or do not fit.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     builder = resolve("detector", DETECTORS, reference.name)
     check_arguments("detector", name, builder, extra_arguments=options)
     name, options = reference.name, {**reference.options, **options}
@@ -53,7 +53,7 @@ def make_detector(
         detector = make("detector", name, builder, options, ("task", "classes", "predict"))
         return detector.to(device) if hasattr(detector, "to") else detector
     # Imported late: listing detectors must not load torch.
-    from ssad.core.checkpoints import fit_state, load_weights
+    from ssad.core.checkpoints import copy_state, load_weights
 
     if weights is None and (SHIPPED / f"{name}.json").is_file():
         weights = SHIPPED / f"{name}.safetensors"
@@ -74,12 +74,12 @@ def make_detector(
         return detector.to(device)
     if path.parent == SHIPPED:
         _check_hash(path, state)
-    fit_state(detector, state, path)
+    copy_state(detector, state, path)
     return detector.to(device)
 
 
 @lru_cache(maxsize=8)
-def loaded_detector(
+def cached_detector(
     name: str, *, weights: str | None = None, device: str = "cpu", input_width: int | None = None
 ) -> Any:
     """Return a detector by name, built once per process and shared: do not change it.

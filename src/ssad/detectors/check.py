@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES
 from ssad.core.protocols import Detector
 from ssad.core.seeding import seed32
-from ssad.detectors.check_cases import BATCH, CheckCase, modules_of, usual_threshold
+from ssad.detectors.check_cases import BATCH, CheckCase, modules_of, typical_threshold
 from ssad.detectors.check_geometry import check_boxes, check_places, check_solids
 from ssad.detectors.check_gradients import check_loss_signs, check_ripples, check_slopes, check_small_changes
 
@@ -86,7 +86,7 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
     ):
         fault_count = len(trial.faults)
         name = run_check.__name__.strip("_").removeprefix("check_").replace("_", " ")
-        with trial.guarded(name), torch.random.fork_rng(devices=[]):
+        with trial.record_errors(name), torch.random.fork_rng(devices=[]):
             # not the state that a caller left: where he has seeded with 0, a detector that does so too changes nothing
             torch.default_generator.manual_seed(seed32("check_detector", name))
             run_check(trial)
@@ -97,7 +97,7 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
 
 
 def _check_names(trial: CheckCase) -> None:
-    detector, need = trial.detector, trial.need
+    detector, need = trial.detector, trial.expect
     name: Any = detector.name
     need(isinstance(name, str) and name != "", "name is a text")
     task: Any = detector.task
@@ -118,7 +118,7 @@ def _check_names(trial: CheckCase) -> None:
 
 
 def _check_dense(trial: CheckCase) -> None:
-    need, images = trial.need, trial.images()
+    need, images = trial.expect, trial.images()
     dense = trial.dense(images)
     classes = len(trial.detector.classes)
     if not need(dense.logit.ndim == 3, "Dense.logit is [B, P, C]"):
@@ -157,27 +157,27 @@ def _check_gradient(trial: CheckCase) -> None:
         images = trial.images(2).requires_grad_()
         dense = trial.dense(images)
         value = getattr(dense, name)[0]
-        if not trial.need(value.requires_grad, f"Dense.{name} is differentiable to the images"):
+        if not trial.expect(value.requires_grad, f"Dense.{name} is differentiable to the images"):
             continue
         (gradient,) = torch.autograd.grad((value.double() ** 2).mean(), images)
-        trial.need(bool(gradient.isfinite().all()), f"the gradient of Dense.{name} is finite")
+        trial.expect(bool(gradient.isfinite().all()), f"the gradient of Dense.{name} is finite")
         limit = torch.tensor(dense.size[::-1], device=value.device)
-        inside = ((dense.box[0, :, :2] > 0) & (dense.box[0, :, 2:] < limit)).any()  # all may be cut at the border
-        reaches_image = bool(gradient[0].any()) or (name == "box" and not bool(inside))
-        trial.need(reaches_image, f"the gradient of Dense.{name} reaches the image")
-        trial.need(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
+        inner_pixels = ((dense.box[0, :, :2] > 0) & (dense.box[0, :, 2:] < limit)).any()  # all may be cut at the border
+        reaches_image = bool(gradient[0].any()) or (name == "box" and not bool(inner_pixels))
+        trial.expect(reaches_image, f"the gradient of Dense.{name} reaches the image")
+        trial.expect(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
 
 
 def _check_predict(trial: CheckCase) -> None:
-    need, images = trial.need, trial.images()
+    need, images = trial.expect, trial.images()
     need(len(trial.predict(images)) == BATCH, "predict answers for each image")
-    threshold = usual_threshold(trial, images)
+    threshold = typical_threshold(trial, images)
     batch_detections = trial.predict(images, threshold=threshold)
     any_detection = False
     for detections in batch_detections:
         any_detection |= len(detections.score) > 0
         for holds, promise in promises(
-            detections, classes=len(trial.detector.classes), is_3d=trial.three, min_score=threshold
+            detections, classes=len(trial.detector.classes), is_3d=trial.is_3d, min_score=threshold
         ):
             need(holds, promise)
     need(any_detection, "predict finds something when the threshold is low")
@@ -255,12 +255,12 @@ def _check_batch(trial: CheckCase) -> None:
                     single_values.shape == batch_values[image_index].shape
                     and _share_of_differences(batch_values[image_index], single_values) <= MAX_DIFFERING
                 )
-                trial.need(agrees, f"Dense.{name} of an image does not depend on its batch")
-    threshold = usual_threshold(trial, images)
+                trial.expect(agrees, f"Dense.{name} of an image does not depend on its batch")
+    threshold = typical_threshold(trial, images)
     batch_detections = trial.predict(images, threshold=threshold)
     for image_index in range(BATCH):
         (single_detections,) = trial.predict(images[image_index : image_index + 1], threshold=threshold)
-        trial.need(
+        trial.expect(
             _detections_agree(batch_detections[image_index], single_detections),
             "detections of an image do not depend on its batch",
         )
@@ -285,7 +285,7 @@ def _detections_agree(first: Detections, second: Detections) -> bool:
 
 
 def _check_losses(trial: CheckCase) -> None:
-    need, detector = trial.need, trial.detector
+    need, detector = trial.expect, trial.detector
     images, truth = trial.images().requires_grad_(), trial.truth()
     dense = trial.dense(images)
     assignment: Assignment = detector.assign(dense, truth)
@@ -356,7 +356,7 @@ def _check_modes(trial: CheckCase) -> None:
     try:
         for index, (submodule, _) in enumerate(modes):
             submodule.training = index % 3 != 1
-        with trial.guarded("predict in training mode"):
+        with trial.record_errors("predict in training mode"):
             trial.predict(trial.images())
     finally:
         for submodule, mode in modes:
@@ -366,28 +366,28 @@ def _check_modes(trial: CheckCase) -> None:
 def _check_sizes(trial: CheckCase) -> None:
     for size in ((67, 91), (33, 40)):
         images = trial.images(1, size).requires_grad_()
-        with trial.guarded(f"pictures of {size[0]} x {size[1]}"):
+        with trial.record_errors(f"pictures of {size[0]} x {size[1]}"):
             dense = trial.dense(images)
-            trial.need(tuple(dense.size) == size, "Dense.size is height and width of the pictures")
+            trial.expect(tuple(dense.size) == size, "Dense.size is height and width of the pictures")
             (gradient,) = torch.autograd.grad(dense.logit.square().mean(), images)
-            trial.need(bool(gradient.any()), f"the gradient reaches pictures of {size[0]} x {size[1]}")
+            trial.expect(bool(gradient.any()), f"the gradient reaches pictures of {size[0]} x {size[1]}")
             trial.predict(images.detach())
 
 
 def _check_refusals(trial: CheckCase) -> None:
     images, detector = trial.images(1), trial.detector
-    intrinsic = trial.lens(1)
+    intrinsic = trial.intrinsics(1)
     dense = trial.dense(images)
 
     def expect_refusal(description: str, call: Callable[[], object]) -> None:
         try:
             call()
         except ConfigError as error:
-            trial.need("\n" not in str(error), f"{description}: refused in one line")
+            trial.expect("\n" not in str(error), f"{description}: refused in one line")
         except Exception as error:  # any other exception is the fault in question
-            trial.need(False, f"{description}: refused with ConfigError, not {type(error).__name__}")
+            trial.expect(False, f"{description}: refused with ConfigError, not {type(error).__name__}")
         else:
-            trial.need(False, f"{description}: refused with ConfigError")
+            trial.expect(False, f"{description}: refused with ConfigError")
 
     for description, bad_images in (
         ("greyscale images", images[:, :1]),

@@ -29,25 +29,25 @@ class CheckCase:
     intrinsic: Tensor | None
     faults: list[str] = field(default_factory=list)
 
-    def need(self, is_kept: bool, promise: str) -> bool:
+    def expect(self, is_kept: bool, promise: str) -> bool:
         """Record a fault if a promise is broken; return True if it is kept."""
         if not is_kept and promise not in self.faults:
             self.faults.append(promise)
         return is_kept
 
     @contextmanager
-    def guarded(self, action: str) -> Iterator[None]:
+    def record_errors(self, action: str) -> Iterator[None]:
         """Turn errors into faults, and record a fault if the block changes the state of the detector."""
         state_before = DetectorState(self.detector)
         try:
             yield
         except Exception as error:  # a third-party detector may raise anything
             self.faults.append(f"{action}: no error, but {describe(error)}")
-        for change in state_before.changed(self.detector):
-            self.need(False, f"no call changes the detector or the program; {action} changes {change}")
+        for change in state_before.describe_changes(self.detector):
+            self.expect(False, f"no call changes the detector or the program; {action} changes {change}")
 
     @property
-    def three(self) -> bool:
+    def is_3d(self) -> bool:
         """True if the detector returns 3D boxes."""
         return bool(self.detector.task == "3d")
 
@@ -67,9 +67,9 @@ class CheckCase:
         smooth = nn.functional.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)
         return (0.7 * smooth + 0.3 * fine).clamp(0, 1).to(self.device())
 
-    def lens(self, count: int = BATCH) -> Tensor | None:
+    def intrinsics(self, count: int = BATCH) -> Tensor | None:
         """Return intrinsics [count, 3, 3]; None for 2D detectors."""
-        if not self.three:
+        if not self.is_3d:
             return None
         height, width = self.size
         focal = 0.8 * width
@@ -79,12 +79,12 @@ class CheckCase:
 
     def dense(self, images: Tensor) -> Dense:
         """Return the dense outputs, with intrinsics for 3D detectors."""
-        result: Dense = self.detector.dense(images, self.lens(len(images)))
+        result: Dense = self.detector.dense(images, self.intrinsics(len(images)))
         return result
 
     def predict(self, images: Tensor, threshold: float | None = None) -> list[Detections]:
         """Return the detections, with intrinsics for 3D detectors."""
-        detections: list[Detections] = self.detector.predict(images, self.lens(len(images)), threshold=threshold)
+        detections: list[Detections] = self.detector.predict(images, self.intrinsics(len(images)), threshold=threshold)
         return detections
 
     def truth(self, counts: tuple[int, ...] = (2, 0, 1)) -> list[Truth]:
@@ -95,7 +95,7 @@ class CheckCase:
         height, width = self.size
         device, classes = self.device(), len(self.detector.classes)
         label = torch.tensor([0, classes - 1][:count], dtype=torch.int64, device=device)
-        intrinsics = self.lens(1)
+        intrinsics = self.intrinsics(1)
         if intrinsics is None:
             shares = torch.tensor([[0.1, 0.15, 0.45, 0.8], [0.5, 0.3, 0.95, 0.9]])[:count]
             box = shares * torch.tensor([width, height] * 2, dtype=torch.float32)
@@ -111,7 +111,7 @@ class CheckCase:
         return Truth(label, box.clamp_min(0).minimum(limit), solid, intrinsics[0])
 
 
-def usual_threshold(trial: CheckCase, images: Tensor) -> float:
+def typical_threshold(trial: CheckCase, images: Tensor) -> float:
     """Return a threshold that leaves some 20 detections in each image."""
     with torch.no_grad():
         dense = trial.dense(images[:1])
@@ -175,7 +175,7 @@ class DetectorState:
         )
         self.draws = torch.get_rng_state()
 
-    def changed(self, detector: Any) -> list[str]:
+    def describe_changes(self, detector: Any) -> list[str]:
         """Return a description of each difference from the recorded state."""
         current = DetectorState(detector)
         changes = []

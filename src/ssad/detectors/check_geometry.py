@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssad.core.detections import Dense, Detections, Solids, Truth
 from ssad.core.tensor_boxes import area, iou, solid_corners
-from ssad.detectors.check_cases import CheckCase, usual_threshold
+from ssad.detectors.check_cases import CheckCase, typical_threshold
 from ssad.detectors.mono3d.decode import hull, project
 
 MAX_COMPARED = 20  # detections compared in an image
@@ -30,9 +30,9 @@ def check_places(trial: CheckCase) -> None:
     with torch.no_grad():
         dense, inverted_dense = trial.dense(images), trial.dense(1 - images)
     is_fixed = dense.place.shape == inverted_dense.place.shape and torch.equal(dense.place, inverted_dense.place)
-    trial.need(is_fixed, "Dense.place depends on the size of the pictures alone, not on what they show")
+    trial.expect(is_fixed, "Dense.place depends on the size of the pictures alone, not on what they show")
     incomplete_levels = [level for level in sorted(set(dense.level.tolist())) if not _covers(dense, level)]
-    trial.need(
+    trial.expect(
         not incomplete_levels,
         f"Dense has places all over the picture, not only the best; level(s) {incomplete_levels} have holes",
     )
@@ -59,14 +59,14 @@ def check_boxes(trial: CheckCase) -> None:
     centre = (box[..., :2] + box[..., 2:]) / 2
     slope, crossed_slope = _centre_slope(centre, place), _centre_slope(centre, place.flip(-1))
     in_pixels = bool((centre.abs() > 2).any()) and slope < 2
-    trial.need(
+    trial.expect(
         in_pixels, "Dense.box is in pixels of the picture, not in shares of it or in pixels of the network's input"
     )
     is_swapped = crossed_slope > 0.2 and crossed_slope > 2 * abs(slope)
-    trial.need(not is_swapped, "Dense.box is x1, y1, x2, y2: its x follows the x of Dense.place, not the y")
+    trial.expect(not is_swapped, "Dense.box is x1, y1, x2, y2: its x follows the x of Dense.place, not the y")
     distances = []
     for detections, image_boxes in zip(
-        trial.predict(images, threshold=usual_threshold(trial, images)), box, strict=True
+        trial.predict(images, threshold=typical_threshold(trial, images)), box, strict=True
     ):
         detected_boxes, place_boxes = (
             _clip(candidate_boxes, trial.size)
@@ -75,7 +75,7 @@ def check_boxes(trial: CheckCase) -> None:
         if len(detected_boxes) and len(place_boxes):
             distances.append((detected_boxes[:, None] - place_boxes).abs().amax(-1).amin(-1))
     agrees = not distances or float(torch.cat(distances).median()) <= NEAR
-    trial.need(agrees, "the boxes of predict are among those of dense, in the same pixels")
+    trial.expect(agrees, "the boxes of predict are among those of dense, in the same pixels")
 
 
 def _centre_slope(centres: Tensor, place: Tensor) -> float:
@@ -110,7 +110,7 @@ class Convention:
     up: float = 0.0
 
     @property
-    def changed(self) -> list[str]:
+    def changed_parts(self) -> list[str]:
         """Names of the parts that differ from the documented convention."""
         differences = {"yaw": self.yaw != "", "size": self.size != (0, 1, 2), "centre": self.up != 0}
         return [name for name, differs in differences.items() if differs]
@@ -124,7 +124,7 @@ class Convention:
         }
         if self.up > 0:
             descriptions["centre"] = "centre of the top face"
-        return " and ".join(descriptions[name] for name in self.changed)
+        return " and ".join(descriptions[name] for name in self.changed_parts)
 
     def apply(self, solid: Solids) -> Solids:
         """Convert solids from this convention to the documented one."""
@@ -149,15 +149,15 @@ YAWS: dict[str, Callable[[Solids], Tensor]] = {
 }
 CONVENTIONS = sorted(
     (Convention(*parts) for parts in product(YAWS, permutations(range(3)), (0.0, -0.5, 0.5))),
-    key=lambda reading: len(reading.changed),
+    key=lambda reading: len(reading.changed_parts),
 )
 
 
 def check_solids(trial: CheckCase) -> None:
     """Check 3D boxes against their 2D boxes and the losses, in the documented convention."""
     images = trial.images()
-    batch_detections = trial.predict(images, threshold=usual_threshold(trial, images))
-    if not trial.three or any(entry.solid is None for entry in batch_detections):
+    batch_detections = trial.predict(images, threshold=typical_threshold(trial, images))
+    if not trial.is_3d or any(entry.solid is None for entry in batch_detections):
         return
     overlaps = [_mean_overlap(trial, batch_detections, convention) for convention in CONVENTIONS]
     best_overlap = max(overlaps)
@@ -170,7 +170,9 @@ def check_solids(trial: CheckCase) -> None:
                 if entry > best_overlap - 0.002
             ]
             # Several conventions may fit equally well; report the simplest, and let the losses decide among those.
-            simplest = [convention for convention in ties if len(convention.changed) == len(ties[0].changed)]
+            simplest = [
+                convention for convention in ties if len(convention.changed_parts) == len(ties[0].changed_parts)
+            ]
             better_convention = min(simplest, key=_loss_of_convention(trial, images, batch_detections))
     else:  # the boxes are not hulls, but predicted
         better_convention = _better_for_losses(trial, images, batch_detections)
@@ -181,7 +183,7 @@ def check_solids(trial: CheckCase) -> None:
         ):
             better_convention = None
     promise = "solids have the centre of gravity, length, height, width and yaw of ssad.core.detections"
-    trial.need(better_convention is None, f"{promise}; these fit better if read otherwise: {better_convention}")
+    trial.expect(better_convention is None, f"{promise}; these fit better if read otherwise: {better_convention}")
 
 
 def _is_better_centre(documented: float, alternative: float) -> bool:
@@ -191,7 +193,7 @@ def _is_better_centre(documented: float, alternative: float) -> bool:
 
 def _mean_overlap(trial: CheckCase, batch_detections: list[Detections], reading: Convention) -> float:
     """Return the mean overlap of the boxes with the hulls of the solids."""
-    intrinsic = trial.lens(1)
+    intrinsic = trial.intrinsics(1)
     image_overlaps = []
     for detections in batch_detections:
         if detections.solid is None or intrinsic is None:
@@ -211,11 +213,11 @@ def _better_for_losses(trial: CheckCase, images: Tensor, batch_detections: list[
     None if there is none, or if the weights are untrained: their losses are as large for one truth as for another.
     """
     loss = _loss_of_convention(trial, images, batch_detections)
-    documented, *alternatives = (convention for convention in CONVENTIONS if len(convention.changed) <= 1)
+    documented, *alternatives = (convention for convention in CONVENTIONS if len(convention.changed_parts) <= 1)
     best_convention = min(alternatives, key=loss)
-    is_better = math.isfinite(loss(documented)) and loss(documented) > CLEAR_RATIOS[best_convention.changed[0]] * loss(
-        best_convention
-    )
+    is_better = math.isfinite(loss(documented)) and loss(documented) > CLEAR_RATIOS[
+        best_convention.changed_parts[0]
+    ] * loss(best_convention)
     with torch.no_grad():
         dense = trial.dense(images)
         losses = trial.detector.losses(dense, trial.detector.assign(dense, trial.truth((2, 1, 1))))
@@ -244,7 +246,7 @@ def _loss_of_convention(
 
 def _detections_as_truth(detections: Detections, reading: Convention, trial: CheckCase) -> Truth:
     """Return the best detections as truth."""
-    intrinsic = trial.lens(1)
+    intrinsic = trial.intrinsics(1)
     assert detections.solid is not None
     assert intrinsic is not None
     solid = reading.apply(detections.solid)

@@ -44,13 +44,13 @@ def check_slopes(trial: CheckCase) -> None:
             for is_silent, channel_values in zip(silent_channels, perturbed_values, strict=True)
         ]
         if all(silent_channels):
-            trial.need(
+            trial.expect(
                 not any(lost_channels),
                 f"the gradient of {name} reaches the image, which {name} depends on (gradient masking: rounding or a "
                 "detached tensor cuts it off)",
             )
             continue
-        trial.need(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
+        trial.expect(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
         ratios: list[float] = []
         for image_index in range(BATCH):
             if image_index == len(probes):
@@ -62,7 +62,7 @@ def check_slopes(trial: CheckCase) -> None:
                 break
         agrees = not ratios or 1 / ROUGHLY < ratios[-1] < ROUGHLY
         promise = f"the gradient of {name} has the sign and roughly the size of its finite differences"
-        trial.need(agrees, f"{promise} (these are {ratios[-1] if ratios else 1:.2g} times what it says)")
+        trial.expect(agrees, f"{promise} (these are {ratios[-1] if ratios else 1:.2g} times what it says)")
 
 
 class _Probe:
@@ -114,11 +114,13 @@ class _Probe:
         slope = float((gradient * direction).sum())
         measured_ratio = math.nan
         for step in STEPS:
-            ahead, behind = (float(self.at(self.images + sign * step * direction)[name]) for sign in (1, -1))
+            value_ahead, value_behind = (
+                float(self.at(self.images + sign * step * direction)[name]) for sign in (1, -1)
+            )
             # The expected difference would drown in float32 rounding.
-            if 2 * step * slope < ROUNDING * (abs(ahead) + abs(behind)) / 2:
+            if 2 * step * slope < ROUNDING * (abs(value_ahead) + abs(value_behind)) / 2:
                 continue
-            measured_ratio = (ahead - behind) / (2 * step * slope)
+            measured_ratio = (value_ahead - value_behind) / (2 * step * slope)
             if 1 / ROUGHLY < measured_ratio < ROUGHLY:
                 break
         return measured_ratio
@@ -141,7 +143,7 @@ def check_small_changes(trial: CheckCase) -> None:
             large_response > ROUNDING * logit[0].norm()
         ):  # else hardly anything changes it, as with some fresh weights
             is_sensitive = bool(small_response > 0.02 * SMALL / LARGE * large_response)
-            trial.need(
+            trial.expect(
                 is_sensitive,
                 "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside (gradient "
                 "masking by rounding)",
@@ -176,7 +178,7 @@ def check_ripples(trial: CheckCase) -> None:
         ratios.append(2 * weakest_step * slope * shares[weakest_step] / max(mean_rise, 1e-30))
         if ratios[-1] > MAX_RIPPLE_RATIO:
             return
-    trial.need(
+    trial.expect(
         False,
         f"steps of up to 2/255 along the gradient of {name} raise it at least half as much as those along the mean "
         f"gradient of nearby images (gradient masking by rippling: {max(ratios):.2g} times as much)",
@@ -206,12 +208,12 @@ def check_loss_signs(trial: CheckCase) -> None:
     for name in case_losses[0]:
         values = [case[name] for case in case_losses]
         is_reversed = min(values) < 0 and max(values) <= 0
-        trial.need(not is_reversed, f'losses["{name}"] rises above 0 when the truth is wrong (is its sign turned?)')
+        trial.expect(not is_reversed, f'losses["{name}"] rises above 0 when the truth is wrong (is its sign turned?)')
     favoured_total, disfavoured_total = (sum(case.values()) for case in case_losses[:2])
     rises = disfavoured_total >= favoured_total - 0.005 * abs(
         favoured_total
     )  # some parts may depend on the class in another way, a little
-    trial.need(rises, "the losses are lower for the classes that Dense.logit favours than for those it does not")
+    trial.expect(rises, "the losses are lower for the classes that Dense.logit favours than for those it does not")
 
 
 def _relabelled_truth(dense: Dense, assignment: Assignment, truth: list[Truth], *, largest: bool) -> list[Truth]:

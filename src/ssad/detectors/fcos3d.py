@@ -10,4 +10,4 @@ from ssad.detectors.mono3d.detector import Mono3D
 
 def fcos3d(*, light: bool = False, seed: int = 0, **options: Any) -> Mono3D:
     """Build FCOS3D with fresh weights; options are fields of `Mono3DConfig`."""
-    return Mono3D((FCOS3D_LIGHT if light else FCOS3D).changed(options), seed=seed)
+    return Mono3D((FCOS3D_LIGHT if light else FCOS3D).with_changes(options), seed=seed)

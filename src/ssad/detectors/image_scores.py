@@ -136,11 +136,11 @@ def gather_images(
         camera_indices = np.repeat(np.arange(count), [len(single.score) for single in sample_detections]).astype(
             np.int32
         )
-        labels = label_table[_joined([single.label for single in sample_detections]).astype(np.int64)]
+        labels = label_table[_join_columns([single.label for single in sample_detections]).astype(np.int64)]
         is_known = labels >= 0
         box, score = (
-            _joined([single.box for single in sample_detections], 4),
-            _joined([single.score for single in sample_detections]),
+            _join_columns([single.box for single in sample_detections], 4),
+            _join_columns([single.score for single in sample_detections]),
         )
         sample_pictures.append(
             SampleImages(
@@ -150,7 +150,7 @@ def gather_images(
     return sample_pictures
 
 
-def _joined(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
+def _join_columns(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
     empty = np.zeros((0,) if width is None else (0, width))
     return np.concatenate([empty, *(tensor.detach().cpu().double().numpy() for tensor in values)])
 
@@ -219,13 +219,13 @@ def match_images(detections: Sequence[SampleImages], truth: ImageTruth, classes:
         np.concatenate([np.zeros(0), *(sample_boxes.score for sample_boxes in boxes_by_sample)]),
     )
     class_count, sample_count = len(MMDET3D_CLASSES), len(truth.samples)
-    matched = match_2d(truth_boxes, detected_boxes, labels=class_count)
-    assert matched.row is not None
+    matched_rows = match_2d(truth_boxes, detected_boxes, labels=class_count)
+    assert matched_rows.row is not None
     truth_counts = np.bincount(
         truth_boxes.label.astype(np.int64) * sample_count + truth_boxes.image // CAMERAS,
         minlength=class_count * sample_count,
     )
-    return ImageMatches(matched, sample_numbers[matched.row], truth_counts.reshape(class_count, sample_count))
+    return ImageMatches(matched_rows, sample_numbers[matched_rows.row], truth_counts.reshape(class_count, sample_count))
 
 
 def image_figures(scores: ImageScores, *, is_summary: bool = False) -> dict[str, float]:

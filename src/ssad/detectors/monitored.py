@@ -43,7 +43,7 @@ class MonitoredDetector:
         if not self.reason:
             try:
                 detections = Detections.cpu(self.detector.predict(images, intrinsic, threshold=threshold))
-                self.reason = self._broken(detections, len(images))
+                self.reason = self._find_broken_promise(detections, len(images))
                 if not self.reason:
                     return detections
             except Exception as error:  # whatever a stranger's detector raises
@@ -67,7 +67,7 @@ class MonitoredDetector:
         text = " ".join(str(error).split())
         self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
 
-    def _broken(self, detections: Sequence[Detections], images: int) -> str:
+    def _find_broken_promise(self, detections: Sequence[Detections], images: int) -> str:
         if len(detections) != images:
             return "broken promise: predict answers for each image"
         for image_detections in detections:

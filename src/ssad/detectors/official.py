@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.boxes import bottom_centre
-from ssad.core.checkpoints import fit_state, load_weights
+from ssad.core.checkpoints import copy_state, load_weights
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
 from ssad.detectors.fcos3d import fcos3d
@@ -46,10 +46,10 @@ def load(name: str, state_dict: Mapping[str, Any] | str | Path) -> Mono3D:
         raise ConfigError(f"load: '{name}' is no detector with official weights; choose fcos3d or pgd")
     detector = _BUILDERS[name]()
     if isinstance(state_dict, str | Path):
-        fit_state(detector, load_weights(state_dict), state_dict)
+        copy_state(detector, load_weights(state_dict), state_dict)
         return detector
     tensors = state_dict.get("state_dict", state_dict)
-    fit_state(detector, {key: torch.as_tensor(value) for key, value in tensors.items()}, "state_dict")
+    copy_state(detector, {key: torch.as_tensor(value) for key, value in tensors.items()}, "state_dict")
     return detector
 
 

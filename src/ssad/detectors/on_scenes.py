@@ -17,7 +17,7 @@ from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
 from ssad.core.types import F64, U8
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.results import with_ego
+from ssad.datasets.nuscenes.results import add_ego_distance
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors.image_scores import gather_images
@@ -26,7 +26,7 @@ from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
 
-Look = Callable[[Sequence[SensorFrame]], Sequence[U8]]
+ImageLoader = Callable[[Sequence[SensorFrame]], Sequence[U8]]
 LABEL = np.array([CLASSES.index(name) for name in MMDET3D_CLASSES])
 _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
 AT_ONCE = 6  # samples that a GPU is shown at once
@@ -49,7 +49,7 @@ class SampleBoxes:
 
 
 def detect_scene(
-    detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
+    detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", load_images: ImageLoader | None = None
 ) -> list[SampleBoxes]:
     """Return the boxes in the world for each sample of a scene.
 
@@ -58,9 +58,9 @@ def detect_scene(
         root: The nuScenes root.
         scene: The scene.
         device: Device of the detector.
-        look: Returns the images of camera frames; None: reads the files.
+        load_images: Returns the images of camera frames; None: reads the files.
     """
-    return detect_with([detector], root, scene, device=device, look=look)[0]
+    return detect_with([detector], root, scene, device=device, load_images=load_images)[0]
 
 
 def detect_with(
@@ -69,7 +69,7 @@ def detect_with(
     scene: SceneData,
     *,
     device: str = "cpu",
-    look: Look | None = None,
+    load_images: ImageLoader | None = None,
     ahead: bool = True,
     at_once: int = AT_ONCE,
 ) -> list[list[Any]]:
@@ -80,8 +80,8 @@ def detect_with(
         root: The nuScenes root.
         scene: The scene.
         device: Device of the detectors.
-        look: Returns the images of camera frames; None: reads the files.
-        ahead: Whether the next pictures are made while these are looked at; False where `look` needs a detector for
+        load_images: Returns the images of camera frames; None: reads the files.
+        ahead: Whether the next pictures are made while these are looked at; False if `load_images` needs a detector for
             itself.
         at_once: Samples that a GPU is shown at once.
 
@@ -98,8 +98,8 @@ def detect_with(
     with ThreadPoolExecutor(4) as pool:
 
         def read(frames: Sequence[SensorFrame]) -> Sequence[U8]:
-            if look is not None:
-                return look(frames)
+            if load_images is not None:
+                return load_images(frames)
             return list(pool.map(lambda frame: read_image(root / frame.filename), frames))
 
         with ThreadPoolExecutor(1) as producer:
@@ -221,7 +221,7 @@ def box_table(detections: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable
         score=column("score"),
         ego_distance=np.full(len(attributes), np.nan),
     )
-    return with_ego(table, truth.ego)
+    return add_ego_distance(table, truth.ego)
 
 
 def match_boxes(detections: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:

@@ -14,4 +14,4 @@ from ssad.detectors.mono3d.detector import Mono3D
 
 def pgd_det(*, light: bool = False, seed: int = 0, **options: Any) -> Mono3D:
     """Build PGD-Det with fresh weights; options are fields of `Mono3DConfig`."""
-    return Mono3D((PGD_DET_LIGHT if light else PGD_DET).changed(options), seed=seed)
+    return Mono3D((PGD_DET_LIGHT if light else PGD_DET).with_changes(options), seed=seed)

@@ -26,8 +26,8 @@ SYSTEMS: dict[str, str] = {
     "careful-reg157": "ssad.drivers.careful.driver:CarefulReg157",
     "careful-rss": "ssad.drivers.careful.driver:CarefulRSS",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
-    "perceiving": "ssad.drivers.perceiving.systems:Composed",
-    "perceiving-perfect": "ssad.drivers.perceiving.systems:Perfect",
+    "perceiving": "ssad.drivers.perceiving.systems:ComposedSystem",
+    "perceiving-perfect": "ssad.drivers.perceiving.systems:PerfectSystem",
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",
     "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",
     "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
@@ -50,7 +50,7 @@ def find_system(name: str) -> Any:
 
     Raises UnknownNameError; ConfigError if it does not import; FormatError for weights that cannot be used.
     """
-    full_name, name = name, Reference.of(name).name
+    full_name, name = name, Reference.parse(name).name
     base_name, _, weights = name.partition(":")
     if base_name in LEARNED and weights:
         return resolve("system", SYSTEMS, base_name)(weights)
@@ -68,7 +68,7 @@ def weights_version(name: str) -> str:
 
     "" for a system without files. Raises FormatError for weights that cannot be used.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     files = [Path(value) for value in reference.options.values() if isinstance(value, str) and Path(value).is_file()]
     if files:
         return digest("files", *[hashlib.blake2b(read_bytes(file, limit=LARGEST)).hexdigest() for file in files])
@@ -82,7 +82,7 @@ def make_system(name: str) -> Driver:
     "mine:Mine?checkpoint=a.pt@first" is `Mine(checkpoint="a.pt")` of mine.py, and tables call it "first".
     Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
-    resolved, options = find_system(name), Reference.of(name).options
+    resolved, options = find_system(name), Reference.parse(name).options
     system = resolved(**options) if isinstance(resolved, type) or options else resolved
     controller = getattr(system, "controller", Controller.EXTERNAL)
     if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):

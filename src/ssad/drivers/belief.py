@@ -12,7 +12,7 @@ from ssad.core.driving import Belief, Believer, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
 from ssad.core.types import F32, Controller, Episode
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 from ssad.drivers.builtin import Autopilot
 
 _SLOTS = 64  # more than the agents of any scene: with fixed draws per step none depends on the number of agents
@@ -34,7 +34,7 @@ class LineOfSight(Autopilot):
     def believe(self, view: Observation) -> Belief:
         """Return the truth without hidden objects."""
         truth: Belief = view.readings["truth"]
-        return truth.keep(in_sight(view.pose[:, :2], truth))
+        return truth.keep(is_visible(view.pose[:, :2], truth))
 
 
 class DegradedBelief(Autopilot):
@@ -104,12 +104,12 @@ class DegradedBelief(Autopilot):
         self._missing[scenes] = missing
         if self.noise > 0.0:
             position_noise = np.stack([self._draws[scene].normal(size=(_SLOTS, 2)) for scene in scenes.tolist()])
-            belief = displace(belief, (self.noise * position_noise[:, :count]).astype(np.float32))
+            belief = move_objects(belief, (self.noise * position_noise[:, :count]).astype(np.float32))
         self._past = [*self._past, belief.keep(~missing[:, :count])][-(self.delay + 1) :]
         return self._past[0]
 
 
-def displace(belief: Belief, displacement: F32) -> Belief:
+def move_objects(belief: Belief, displacement: F32) -> Belief:
     """The belief with its objects and their forecasts moved by [B, K, 2] m."""
     pose = belief.pose.copy()
     pose[..., :2] += displacement

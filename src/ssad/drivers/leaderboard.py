@@ -206,7 +206,7 @@ class Leaderboard:
             agent.sensors()  # some agents initialise themselves in sensors()
             route = episode.agents[0].route
             assert route is not None
-            gps_plan, world_plan = _global_plan_of(route, load_town(episode.town))
+            gps_plan, world_plan = _global_plan(route, load_town(episode.town))
             agent.set_global_plan(gps_plan, world_plan)
             self._agents.append(agent)
 
@@ -216,13 +216,13 @@ class Leaderboard:
         for row, scene in enumerate(view.scene.tolist()):
             if view.done[row]:
                 continue
-            control = self._agents[scene].run_step(self._input(view, row), float(view.time[row]))
+            control = self._agents[scene].run_step(self._agent_input(view, row), float(view.time[row]))
             controls[row] = control.throttle, control.brake, -control.steer, bool(getattr(control, "reverse", False))
             if getattr(control, "hand_brake", False):
                 controls[row, :2] = 0.0, 1.0
         return controls
 
-    def _input(self, view: Observation, row: int) -> dict[str, tuple[int, Any]]:
+    def _agent_input(self, view: Observation, row: int) -> dict[str, tuple[int, Any]]:
         time, yaw = float(view.time[row]), float(view.pose[row, 2])
         step = round(time / STEP)
         readings: dict[str, tuple[int, Any]] = {}
@@ -261,7 +261,7 @@ class Leaderboard:
         return np.array([float(view.accel[row]), lateral, GRAVITY, 0.0, 0.0, -yaw_rate, compass])
 
 
-def _global_plan_of(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
+def _global_plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
     """Return the plan of a route, a point per metre: geographic and as CARLA's transforms, with `RoadOption`."""
     import carla
 

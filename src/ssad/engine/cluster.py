@@ -24,7 +24,7 @@ TASKS_PER_CPU = 2  # more than one, so that no CPU idles until the next task arr
 _BACKENDS: dict[str, LocalProcesses] = {}  # backends of this Ray worker, by the representation of their start
 
 
-def _on_node(call: tuple[Any, Any, float], start: Start | None) -> Any:
+def _run_on_node(call: tuple[Any, Any, float], start: Start | None) -> Any:
     """Run a task of a Ray worker in its child process and return the fields of the outcome."""
     function, argument, timeout_s = call
     start_key = repr(start)
@@ -82,7 +82,7 @@ class RayCluster:
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": LOST_NODES, "runtime_env": {"env_vars": environment}}
         if gpu_share:
             options["num_gpus"] = gpu_share
-        self._remote = ray.remote(**options)(_on_node)
+        self._remote = ray.remote(**options)(_run_on_node)
         self._start = ray.put(start)
         self._tasks: dict[Any, Task] = {}
 

@@ -21,16 +21,16 @@ def command_of(suite: SuiteBase, device: str | None = None) -> str:
     arguments = ["ssad", "run", origin] + (["--device", device] if device else [])
     for key, value in values.items():
         if value != defaults.get(key):
-            arguments += ["--set", f"{key}={_flow(set_values.get(key, value))}"]
+            arguments += ["--set", f"{key}={_inline_yaml(set_values.get(key, value))}"]
     return shlex.join(arguments)
 
 
-def _flow(value: Any) -> str:
+def _inline_yaml(value: Any) -> str:
     """Return a value as YAML in one line; keys without a value are left out of mappings in lists."""
     if isinstance(value, list):
-        return f"[{','.join(_flow(_without_empty(entry)) for entry in value)}]"
+        return f"[{','.join(_inline_yaml(_without_empty(entry)) for entry in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(entry)}" for key, entry in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {_inline_yaml(entry)}" for key, entry in value.items()) + "}"
     return "null" if value is None else str(value)
 
 

@@ -168,7 +168,7 @@ class Replay:
         compared: Compared results, in words.
         picture: Makes a picture of the system's input and output, clean and under the cell's condition.
         film: Frames [H, W, 3] of the driver's camera, with the seconds between two of them; None: there are none.
-        seen: Perception of the driver: input, detections, belief; None: it does not perceive.
+        perception: Perception of the driver: input, detections, belief; None: it does not perceive.
     """
 
     cell: Cell
@@ -178,7 +178,7 @@ class Replay:
     compared: str = ""
     picture: Callable[[], U8] | None = None
     film: tuple[Iterator[U8], float] | None = None
-    seen: Any = None
+    perception: Any = None
 
 
 class CellError(SSADError):
@@ -278,7 +278,7 @@ class Kind(ABC):
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Return cells in batches for `execute`: of one system, alike, and fewer where workers would idle."""
-        return grouped(cells, plan.suite.chunk, workers=workers, group_key=self.alike)
+        return make_batches(cells, plan.suite.chunk, workers=workers, group_key=self.alike)
 
     def alike(self, cell: Cell) -> Hashable:
         """Return a value that is equal for cells that can run as one batch; they share a system."""
@@ -384,7 +384,7 @@ def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
     raise ConfigError(f"suite {suite.name}: {key}: a name appears twice{hint}")
 
 
-def grouped(
+def make_batches(
     cells: Sequence[Cell], chunk: int, *, workers: int, group_key: Callable[[Cell], Hashable]
 ) -> list[list[Cell]]:
     """Batches of cells with a value in common, of `chunk` at most, and smaller where cells are few for the workers."""

@@ -68,7 +68,7 @@ class Worker:
         with contextlib.suppress(OSError):  # a dead worker is noticed by the end of its answers
             self._requests.send(message)
 
-    def give(self, task: Task) -> TaskOutcome | None:
+    def start_task(self, task: Task) -> TaskOutcome | None:
         """Start a task; return an outcome if the task cannot even be sent."""
         self.task, self.began = task, time.monotonic()
         try:
@@ -85,7 +85,7 @@ class Worker:
         task, self.task = self.task, None
         return TaskOutcome(task, status, value, reason, error, time.monotonic() - self.began)
 
-    def hear(self) -> TaskOutcome | None:
+    def read_answer(self) -> TaskOutcome | None:
         """Read an answer: the worker is ready, or its task has an outcome.
 
         Returns:
@@ -98,8 +98,8 @@ class Worker:
             kind, value = self.answers.recv()
         except (EOFError, OSError):
             if not self.ready:
-                raise SSADError(f"a worker process cannot start: {self.how_it_ended()}") from None
-            return self.outcome("crashed", self.how_it_ended()) if self.task is not None else None
+                raise SSADError(f"a worker process cannot start: {self.describe_exit()}") from None
+            return self.outcome("crashed", self.describe_exit()) if self.task is not None else None
         if kind == "fatal":
             raise SSADError(value)
         if kind == "ready":
@@ -109,32 +109,32 @@ class Worker:
             return self.outcome("ok", value=value)
         return self.outcome("failed", str(value), error=value if isinstance(value, SSADError) else None)
 
-    def overdue(self) -> TaskOutcome:
+    def time_out(self) -> TaskOutcome:
         """Return the outcome of a task that timed out.
 
         Raises:
             SSADError: The start of the worker timed out.
         """
         if not self.ready:
-            raise SSADError(f"a worker process did not start within {START_S:.0f} s: {self._last_words()}")
+            raise SSADError(f"a worker process did not start within {START_S:.0f} s: {self._last_output_line()}")
         assert self.task is not None
         return self.outcome("timeout", f"took longer than {self.task.timeout_s:g} s")
 
-    def memory(self) -> int:
+    def resident_bytes(self) -> int:
         """Resident memory of the process, bytes; 0 where it is unknown."""
         try:
             return int(Path(f"/proc/{self.process.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         except (OSError, IndexError, ValueError):
             return 0
 
-    def _last_words(self) -> str:
+    def _last_output_line(self) -> str:
         """Return the last line of the process's output."""
         log_size = self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, log_size - 4096))
         lines = [line.strip() for line in self._log.read().decode(errors="replace").splitlines()]
         return next((line for line in reversed(lines) if line), "")[:300]
 
-    def how_it_ended(self) -> str:
+    def describe_exit(self) -> str:
         """Wait for the process to end and describe its exit.
 
         Returns:
@@ -146,10 +146,10 @@ class Worker:
             cause = f"killed by {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
         except ValueError:
             cause = f"killed by signal {-exit_code}"
-        last_line = self._last_words()
+        last_line = self._last_output_line()
         return f"the process ended ({cause}){f': {last_line}' if last_line else ''}"
 
-    def end(self) -> None:
+    def kill(self) -> None:
         """Kill the process and release its resources."""
         if self.process.poll() is None:
             self.process.kill()
@@ -179,9 +179,9 @@ class LocalProcesses:
         self._workers: list[Worker] = []
         self._waiting: list[Task] = []
         self._failed_outcomes: list[TaskOutcome] = []
-        self._started = 0
-        self._looked = time.monotonic()
-        self._plenty = (0, time.monotonic())  # total memory, and the last time at which enough was free
+        self._started_count = 0
+        self._last_check_time = time.monotonic()
+        self._last_ample_memory = (0, time.monotonic())  # total memory, and the last time at which enough was free
 
     @property
     def busy(self) -> int:
@@ -200,33 +200,33 @@ class LocalProcesses:
         Raises:
             SSADError: No worker can start.
         """
-        self._hand_out()
+        self._assign_tasks()
         outcomes, self._failed_outcomes = self._failed_outcomes, []
         wait_seconds = min(
             [seconds, LOOK_S, *(max(0.0, candidate.deadline - time.monotonic()) for candidate in self._workers)]
         )
         for connection in wait([candidate.answers for candidate in self._workers], 0.0 if outcomes else wait_seconds):
             worker = next(candidate for candidate in self._workers if candidate.answers is connection)
-            outcome = worker.hear()
+            outcome = worker.read_answer()
             if outcome is not None:
                 outcomes.append(outcome)
             if worker.process.poll() is not None or (outcome is not None and outcome.status == "crashed"):
                 self._remove(worker)
         current_time = time.monotonic()
         for worker in [candidate for candidate in self._workers if current_time > candidate.deadline]:
-            outcomes.append(worker.overdue())
+            outcomes.append(worker.time_out())
             self._remove(worker)
-        if current_time - self._looked > LOOK_S:
-            self._looked = current_time
+        if current_time - self._last_check_time > LOOK_S:
+            self._last_check_time = current_time
             outcomes += self._guard_memory()
-        self._hand_out()
+        self._assign_tasks()
         return outcomes
 
-    def _hand_out(self) -> None:
+    def _assign_tasks(self) -> None:
         """Assign tasks to idle workers, and start workers while tasks outnumber them."""
         for worker in self._workers:
             if worker.ready and worker.task is None and self._waiting:
-                failed_outcome = worker.give(self._waiting.pop(0))
+                failed_outcome = worker.start_task(self._waiting.pop(0))
                 if failed_outcome is not None:
                     self._failed_outcomes.append(failed_outcome)
         idle = sum(worker.task is None for worker in self._workers)
@@ -236,28 +236,28 @@ class LocalProcesses:
             thread_count = os.environ.get("OMP_NUM_THREADS", str(self._threads))  # PyTorch asks MKL before OpenMP
             environment = {name: os.environ.get(name, thread_count) for name in THREADS}
             if self._gpus:
-                environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started % len(self._gpus)]
+                environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started_count % len(self._gpus)]
             self._workers.append(Worker(self._start, environment))
-            self._started += 1
+            self._started_count += 1
             idle += 1
 
     def _guard_memory(self) -> list[TaskOutcome]:
         """Kill workers above the memory limit, and the largest worker before the machine runs out of memory."""
-        workers_by_memory = [(worker.memory(), worker) for worker in self._workers if worker.task is not None]
+        workers_by_memory = [(worker.resident_bytes(), worker) for worker in self._workers if worker.task is not None]
         memory_limit = int(os.environ.get(WORKER_MEMORY) or 0)
         too_large = [
             (memory, candidate) for memory, candidate in workers_by_memory if memory_limit and memory > memory_limit
         ]
-        total_memory, free_memory = memory_left()
+        total_memory, free_memory = available_memory()
         current_time = time.monotonic()
         if (
-            free_memory >= SCARCE * total_memory or total_memory != self._plenty[0]
+            free_memory >= SCARCE * total_memory or total_memory != self._last_ample_memory[0]
         ):  # a virtual machine may grow with its use
-            self._plenty = total_memory, current_time
+            self._last_ample_memory = total_memory, current_time
         # A short dip does not kill: the shortage must last. One worker is killed at a time.
-        elif workers_by_memory and not too_large and current_time - self._plenty[1] > SCARCE_S:
+        elif workers_by_memory and not too_large and current_time - self._last_ample_memory[1] > SCARCE_S:
             too_large = [max(workers_by_memory, key=lambda entry: entry[0])]
-            self._plenty = total_memory, current_time
+            self._last_ample_memory = total_memory, current_time
         outcomes = []
         for memory, worker in too_large:
             cause = (
@@ -271,16 +271,16 @@ class LocalProcesses:
 
     def _remove(self, worker: Worker) -> None:
         self._workers.remove(worker)
-        worker.end()
+        worker.kill()
 
     def close(self) -> None:
         """Kill all workers."""
         for worker in self._workers:
-            worker.end()
+            worker.kill()
         self._workers, self._waiting = [], []
 
 
-def memory_left() -> tuple[int, int]:
+def available_memory() -> tuple[int, int]:
     """Return the memory of this machine, or of the container that this process runs in.
 
     Returns:

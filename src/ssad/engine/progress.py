@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 EVERY_S = 10.0  # between plain lines
 
 
-class Live:
+class LiveProgress:
     """Context manager: a Rich progress bar on a terminal, else a line every ten seconds."""
 
     def __init__(self, title: str, total: int, completed: int, *, console: Console, unit: str = "cells") -> None:
@@ -35,7 +35,7 @@ class Live:
         seconds = round((time.monotonic() - self.start_time) / finished_count * (self.total - self.completed))
         return f"eta {seconds // 60:02d}:{seconds % 60:02d}"
 
-    def note(self) -> str:
+    def status(self) -> str:
         """Return the number of failures and the remaining time."""
         failed = f"{self.failed} failed  " if self.failed else ""
         return failed + self.remaining_time()
@@ -53,14 +53,14 @@ class Live:
     def tick(self) -> None:
         """Update the display."""
         if self.bar:
-            self.bar.update(self.task, completed=self.completed, total=self.total, note=self.note())
+            self.bar.update(self.task, completed=self.completed, total=self.total, note=self.status())
         elif time.monotonic() - self.last_line_time >= EVERY_S:
             self.last_line_time = time.monotonic()
             self.line()
 
     def line(self) -> None:
         """Print one plain line."""
-        self.console.print(f"{self.title}: {self.completed}/{self.total} {self.unit}  {self.note()}")
+        self.console.print(f"{self.title}: {self.completed}/{self.total} {self.unit}  {self.status()}")
 
     def __enter__(self) -> Self:
         if self.bar:

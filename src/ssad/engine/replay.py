@@ -30,7 +30,7 @@ def replay_cell(plan: Plan, folder: str | Path, name: str) -> Replay:
     return plan.kind.replay(plan, cell, record, Path(folder))
 
 
-def difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
+def describe_difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
     """Return the first difference between a result and its record, in words; None: there is none."""
     for part, value in result.items():
         if isinstance(value, dict):

@@ -12,13 +12,13 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.machine import default_workers, machine, versions
+from ssad.core.machine import default_workers, machine_properties, versions
 from ssad.core.run_records import value_problem
 from ssad.core.seeding import digest
 from ssad.engine.command import command_of
 from ssad.engine.kind import Cell, CellError, Job, Kind, Plan, Resources
 from ssad.engine.pool import Pool, open_pool
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 from ssad.engine.store import Store
 from ssad.engine.task import Task, TaskOutcome
 
@@ -48,7 +48,7 @@ def run(
         SSADError: No worker can start, or data cannot be made.
     """
     resources = resources or Resources(device=plan.device)
-    selected_cells = slice_of(plan, only or {})  # a wrong name raises before a folder is made
+    selected_cells = select_cells(plan, only or {})  # a wrong name raises before a folder is made
     header, results_folder = run_json(plan), Path(folder).resolve()
     with Store.open(folder, header, retry=[cell.key for cell in selected_cells] if retry else False) as store:
         missing = sorted((c for c in selected_cells if c.key not in store.results), key=plan.kind.order)
@@ -56,11 +56,11 @@ def run(
             retried_cells = [cell for cell in missing if cell.key in store.retried]
             settings = plan.kind.prepare(plan, results_folder, resources, retry=retried_cells)
             job = Job(results_folder, plan.device, settings)
-            _Schedule(plan, job, store, header["versions"], resources).work(missing)
+            _Schedule(plan, job, store, header["versions"], resources).run_cells(missing)
         return [store.results[cell.key] for cell in plan.cells if cell.key in store.results]
 
 
-def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
+def select_cells(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
     """Return the cells whose fields, or name, have one of these values, as text.
 
     A value "a,b" means a and b, unless a cell has that very value.
@@ -98,7 +98,7 @@ def run_json(plan: Plan) -> dict[str, Any]:
         "versions": {**versions(plan.device), **plan.versions},
         "code": kind.code,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": machine(),
+        "machine": machine_properties(),
         "columns": [{key: value for key, value in vars(c).items() if key != "limits"} for c in kind.columns],
         "limits": {name: list(pair) for name, pair in kind.limits.items()},
         "factors": list(kind.factors),
@@ -123,9 +123,9 @@ class _Schedule:
         self.failure_counts: Counter[str] = Counter()  # system -> its crashes and time-outs
         self.given_up: dict[str, TaskOutcome] = {}
         self.pool: Pool
-        self.progress: Live
+        self.progress: LiveProgress
 
-    def work(self, missing: Sequence[Cell]) -> None:
+    def run_cells(self, missing: Sequence[Cell]) -> None:
         """Run cells until each has a record."""
         for cell in missing:
             pieces = self.kind.pieces(cell, self.job)
@@ -138,14 +138,17 @@ class _Schedule:
         task_count = len(self.data) + len(missing)
         resources = self.resources
         workers = self.kind.workers(self.plan, resources.workers)
-        initialiser = (_start, (self.kind, self.job))  # of every kind: importing it takes seconds that are no cell's
+        initialiser = (
+            _start_worker,
+            (self.kind, self.job),
+        )  # of every kind: importing it takes seconds that are no cell's
         total = len(self.plan.cells) + len(self.data)
         finished_count = len(self.plan.cells) - len(missing)
         with (
             open_pool(
                 task_count, workers=workers, ray=resources.ray, device=self.plan.device, start=initialiser
             ) as self.pool,
-            Live(self.plan.suite.name, total, finished_count, console=resources.console) as self.progress,
+            LiveProgress(self.plan.suite.name, total, finished_count, console=resources.console) as self.progress,
         ):
             for batch in self.kind.batches(self.plan, ready_cells, min(task_count, workers or default_workers())):
                 self._add(batch)
@@ -161,11 +164,11 @@ class _Schedule:
     def _add(self, batch: list[Cell], *, first: bool = False) -> None:
         # a batch may take longer than one cell, but not the sum of all
         time_limit = self.timeout * (1 if len(batch) == 1 else 2)
-        self.pool.add(Task(_execute, (self.kind, batch, self.job), time_limit, label=batch), first=first)
+        self.pool.add(Task(_execute_batch, (self.kind, batch, self.job), time_limit, label=batch), first=first)
 
     def _add_piece(self, name: str, systems: Sequence[str], *, first: bool = False) -> None:
         argument = (self.kind, name, self.data[name], tuple(systems), self.job)
-        self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
+        self.pool.add(Task(_make_piece, argument, self.timeout, label=(name, tuple(systems))), first=first)
 
     def _piece_ended(self, name: str, systems: Sequence[str], outcome: TaskOutcome) -> None:
         """Release the cells that waited; a piece that failed for several systems is done again for each alone."""
@@ -180,7 +183,7 @@ class _Schedule:
             self._release(name, system, outcome.seconds / len(systems))
         if outcome.status != "ok":
             self._stop_sharing(systems[0])
-            self._blame(systems[0], outcome)
+            self._count_failure(systems[0], outcome)
 
     def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
         waiting_cells = self.waiting_cells.pop((name, system), [])
@@ -214,7 +217,7 @@ class _Schedule:
             self._record(
                 batch[0], outcome.status, reason, {}, outcome.seconds + self.shared_seconds.get(batch[0].key, 0.0)
             )
-            self._blame(batch[0].system, outcome)
+            self._count_failure(batch[0].system, outcome)
 
     def _stop_sharing(self, system: str) -> None:
         """Exclude a system that failed alone from shared pieces: its cells do without them from now on."""
@@ -228,7 +231,7 @@ class _Schedule:
                 self._add_piece(name, remaining_systems)
             self._release(name, system)
 
-    def _blame(self, system: str, outcome: TaskOutcome) -> None:
+    def _count_failure(self, system: str, outcome: TaskOutcome) -> None:
         """Count a system's time-outs and crashes; after `patience` of them, give it up."""
         if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
             return
@@ -271,17 +274,17 @@ class _Schedule:
         self.progress.advance(status == "ok")
 
 
-def _start(argument: tuple[Kind, Job]) -> None:
+def _start_worker(argument: tuple[Kind, Job]) -> None:
     kind, job = argument
     kind.start(job)
 
 
-def _make(argument: tuple[Kind, str, Any, Sequence[str], Job]) -> None:
+def _make_piece(argument: tuple[Kind, str, Any, Sequence[str], Job]) -> None:
     kind, name, data, systems, job = argument
     kind.make(name, data, systems, job)
 
 
-def _execute(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, Any]]:
+def _execute_batch(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, Any]]:
     """Return the results of a batch, checked to be plain data, with the hashes of their artefacts."""
     kind, batch, job = argument
     results = kind.execute(batch, job)

@@ -1,4 +1,4 @@
-"""Sample size of a suite: the cases that it has, and those that a difference of two rates needs."""
+"""CaseSample size of a suite: the cases that it has, and those that a difference of two rates needs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ssad.engine.kind import Cell, Kind, Plan, SuiteBase
 from ssad.experiments.suites import KINDS, kind_of
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.sample_size import (
+    CaseSample,
     FlipRate,
-    Sample,
     detectable_difference,
     necessary_clusters,
     power,
@@ -67,10 +67,10 @@ class Need:
     detectable: float | None
 
 
-def sample_of(plan: Plan) -> Sample:
+def sample_of(plan: Plan) -> CaseSample:
     """Return the cases of a plan: scenarios with their repetitions, which all systems meet, in their clusters."""
     clusters = {_case(cell): str(cell.fields.get("cluster") or _case(cell)) for cell in plan.cells}
-    return Sample.of(clusters.values())
+    return CaseSample.of(clusters.values())
 
 
 def sample_line(plan: Plan) -> str:
@@ -106,7 +106,7 @@ def detection_lines(plan: Plan, difference: float, *, target: float, folders: Se
     """
     kind = plan.kind
     check_rates(plan.suite)
-    measurement = of_runs(kind, folders) if folders else reference(plan)
+    measurement = measure_runs(kind, folders) if folders else reference_measurement(plan)
     sample = sample_of(plan)
     # Pairs that differ by about as much come first: their flip rate is that of such a difference.
     pairs = sorted(measurement.pairs, key=lambda pair: abs(abs(pair.flips.difference) - difference))
@@ -121,7 +121,7 @@ def detection_lines(plan: Plan, difference: float, *, target: float, folders: Se
     ]
 
 
-def of_runs(kind: Kind, folders: Sequence[Path]) -> Measurement:
+def measure_runs(kind: Kind, folders: Sequence[Path]) -> Measurement:
     """Return the flip rates of results folders.
 
     Args:
@@ -139,7 +139,7 @@ def of_runs(kind: Kind, folders: Sequence[Path]) -> Measurement:
     return _measurement(kind, runs, f"measured in {', '.join(str(run.folder) for run in runs)}")
 
 
-def reference(plan: Plan) -> Measurement:
+def reference_measurement(plan: Plan) -> Measurement:
     """Return the measured flip rates of shipped systems on the scenarios that are most like those of a suite.
 
     Args:
@@ -173,7 +173,7 @@ def reference(plan: Plan) -> Measurement:
     return Measurement(pairs, best["cases"], source)
 
 
-def measured(run: Run, kind: Kind, scenarios: Sequence[str], selection: Sequence[str]) -> dict[str, Any]:
+def reference_entry(run: Run, kind: Kind, scenarios: Sequence[str], selection: Sequence[str]) -> dict[str, Any]:
     """Return the flip rates of a run as plain data for the reference.
 
     Args:
@@ -216,11 +216,11 @@ def _rounded(value: Any) -> Any:
 def pair_from(entry: Mapping[str, Any]) -> PairFlips:
     """Return a flip rate from plain data, in which null stands for NaN."""
     numbers: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry["flips"].items()}
-    flips = FlipRate(**(numbers | {"sample": Sample(**numbers["sample"])}))
+    flips = FlipRate(**(numbers | {"sample": CaseSample(**numbers["sample"])}))
     return PairFlips(entry["rate"], entry["first"], entry["second"], flips)
 
 
-def _need(pair: PairFlips, difference: float, sample: Sample, *, target: float) -> Need:
+def _need(pair: PairFlips, difference: float, sample: CaseSample, *, target: float) -> Need:
     flips = pair.flips
     # Where the cases of one cluster cannot be compared, they count as all alike.
     correlation, rate_correlation = (
@@ -237,7 +237,7 @@ def _need(pair: PairFlips, difference: float, sample: Sample, *, target: float) 
     )
 
 
-def _rows(needs: Mapping[str, Sequence[Need]], sample: Sample) -> Iterator[tuple[str, ...]]:
+def _rows(needs: Mapping[str, Sequence[Need]], sample: CaseSample) -> Iterator[tuple[str, ...]]:
     """Yield the lines of the table: several pairs of the first rate, and the first pair of each other rate."""
     for rate_index, rate_needs in enumerate(needs.values()):
         for need in rate_needs[: 1 if rate_index else MAX_PAIRS]:
@@ -258,7 +258,7 @@ def _rows(needs: Mapping[str, Sequence[Need]], sample: Sample) -> Iterator[tuple
             yield (rate_needs[0].pair.rate, f"and {hidden_count} other pairs", *[""] * (len(HEADS) - 2))
 
 
-def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, sample: Sample) -> Iterator[str]:
+def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, sample: CaseSample) -> Iterator[str]:
     """Yield sentences about the suite, the measured flip rates and the columns."""
     size = f"The suite has {sample.cases:.0f} cases in {sample.clusters:.0f} clusters"
     first_needs = next(iter(needs.values()))
@@ -275,7 +275,7 @@ def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, samp
     yield f"Flip rates: {measurement.source}."
     yield (
         "difference, flip rate, design effect: as measured; pairs that differ by about as much as is to be detected "
-        "come first."
+        "come first. A flip rate below that counts as that, since a difference flips at least as many cases."
     )
     yield (
         f"cases, clusters: paired, both systems in each, with {sample.mean_size:.1f} cases a cluster as in the suite; "

@@ -10,8 +10,8 @@ from typing import Any, Literal, Self
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.lane_graph import SignKind, save_graph, town_file
-from ssad.core.machine import quiet_warp
-from ssad.core.safeio import plain
+from ssad.core.machine import start_warp_quietly
+from ssad.core.safeio import to_plain_json
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace, Scenario
@@ -20,7 +20,7 @@ from ssad.metrics import episode_metrics
 from ssad.simulators.closed_loop import (
     HIGHWAY,
     cached_town,
-    load_world,
+    load_kernels,
     policies_of,
     scenario_json,
     system_version,
@@ -56,14 +56,14 @@ class ScenarioSuite(SuiteBase):
         return self.model_copy(update={"scenarios": [find(ref) for ref in self.scenarios]})
 
 
-def route_of(scenario: Scenario) -> str:
+def route_key(scenario: Scenario) -> str:
     """Return a key of the town and the route of a scenario; scenarios with the same key points share it."""
     points = [(round(float(pose.x), 2) + 0.0, round(float(pose.y), 2) + 0.0) for pose in scenario.route]  # no -0.0
     return f"{scenario.town} {digest('route', scenario.town, points)[:8]}"
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class DescribedScenario:
     """A scenario of a suite, as plain data, with the versions of its town, its type and its actors' drivers."""
 
     scenario: Scenario
@@ -77,7 +77,7 @@ class ScenarioKind(Kind):
     def scenario_cell(
         self,
         suite: ScenarioSuite,
-        described_scenario: Described,
+        described_scenario: DescribedScenario,
         *inputs: object,
         title: str,
         system: str,
@@ -100,7 +100,7 @@ class ScenarioKind(Kind):
         kind, *seed_parts = chance
         seed = seed32(kind, suite.seed, safeio.dump_json(described_scenario.data), *seed_parts)
         scenario = described_scenario.scenario
-        cluster = scenario.name if suite.cluster == "scenario" else route_of(scenario)
+        cluster = scenario.name if suite.cluster == "scenario" else route_key(scenario)
         identification = {"system": system, "group": scenario.group or scenario.type, "cluster": cluster}
         cell_spec = {"scenario": described_scenario.data, "system": system, **spec}
         return self.make_cell(
@@ -118,7 +118,7 @@ class ScenarioKind(Kind):
 
     def start(self, job: Job) -> None:
         """Load the world's kernels, which are compiled on first use."""
-        load_world(job.device)
+        load_kernels(job.device)
 
     def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
         """Drive the cell of a record again and return its trace.
@@ -130,7 +130,7 @@ class ScenarioKind(Kind):
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
         """Drive the episode again and compare every bit of its trace."""
-        quiet_warp()
+        start_warp_quietly()
         trace = self.drive_again(plan, cell, record)
         recorded = load_trace(folder / record["artefacts"]["trace"])
         return Replay(cell, first_difference(recorded, trace), trace, cached_town(trace.town))
@@ -141,13 +141,13 @@ def drive_record(cell: Cell, episode: Episode, trace: EpisodeTrace, folder: Path
     artefact = f"traces/{cell.key}.npz"
     save_trace(folder / artefact, trace)
     has_stop_signs = bool((cached_town(trace.town).sign_kind == SignKind.STOP).any())
-    metrics = plain(episode_metrics(trace, stop_signs=has_stop_signs).as_dict())
+    metrics = to_plain_json(episode_metrics(trace, stop_signs=has_stop_signs).as_dict())
     episode_fields = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
     episode_fields |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
     return {"metrics": metrics, "artefacts": {"trace": artefact}, "episode": episode_fields, "case": motion_hash(trace)}
 
 
-def described(suite: ScenarioSuite) -> tuple[list[Described], dict[str, str]]:
+def describe_scenarios(suite: ScenarioSuite) -> tuple[list[DescribedScenario], dict[str, str]]:
     """Return all scenarios of a suite, in order, and the versions of their towns.
 
     Raises:
@@ -159,7 +159,9 @@ def described(suite: ScenarioSuite) -> tuple[list[Described], dict[str, str]]:
     for scenario in scenarios:
         policies = [system_version(name) for name in policies_of(scenario)]
         entries.append(
-            Described(scenario, scenario_json(scenario), (towns[scenario.town], type_version(scenario.type), *policies))
+            DescribedScenario(
+                scenario, scenario_json(scenario), (towns[scenario.town], type_version(scenario.type), *policies)
+            )
         )
     return entries, towns
 

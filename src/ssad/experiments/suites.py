@@ -14,7 +14,7 @@ from pydantic import ValidationError
 import ssad
 from ssad.core.errors import ConfigError, UnknownNameError, unknown_name
 from ssad.core.registry import resolve
-from ssad.core.safeio import Document, dotted, parse_yaml, read_yaml_document
+from ssad.core.safeio import Document, format_location, parse_yaml, read_yaml_document
 from ssad.engine.kind import Kind, SuiteBase
 
 KINDS: dict[str, str] = {
@@ -87,11 +87,11 @@ def load_suite(reference: str, settings: Sequence[str] = ()) -> Any:
         ) from None
     setting_of_key: dict[str, str] = {}
     for setting in settings:
-        setting_of_key[_apply(data, setting, schema)] = setting
+        setting_of_key[_apply_setting(data, setting, schema)] = setting
     try:
         suite = schema.model_validate(data).beside(path)
     except ValidationError as error:
-        raise _explain(error, document, setting_of_key, list(schema.model_fields)) from None
+        raise _explain_error(error, document, setting_of_key, list(schema.model_fields)) from None
     suite._origin = reference
     try:
         suite._stock = schema.model_validate(document.data).beside(path).model_dump(mode="json")
@@ -100,7 +100,7 @@ def load_suite(reference: str, settings: Sequence[str] = ()) -> Any:
     return suite
 
 
-def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
+def _apply_setting(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
     """Put one `key=value` into the data; return the top-level key."""
     key, separator, text = setting.partition("=")
     parts = key.strip().split(".")
@@ -109,7 +109,7 @@ def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
     if parts[0] not in schema.model_fields:
         raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], list(schema.model_fields))}")
     value = parse_yaml(text, f"--set {key}")
-    if len(parts) == 1 and _is_list(schema, parts[0]) and isinstance(value, str | int):
+    if len(parts) == 1 and _takes_list(schema, parts[0]) and isinstance(value, str | int):
         value = [value]
     mapping = data
     for part in parts[:-1]:
@@ -123,7 +123,7 @@ def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
     return parts[0]
 
 
-def _is_list(schema: type[SuiteBase], key: str) -> bool:
+def _takes_list(schema: type[SuiteBase], key: str) -> bool:
     """Return whether a key takes a list; one value alone then is a list of one."""
     return typing.get_origin(schema.model_fields[key].annotation) is list
 
@@ -136,7 +136,7 @@ def _unknown_key(key: str, known_keys: Sequence[str]) -> str:
 UNION = re.compile(r"constrained-\w+|literal\[.*\]")  # how pydantic names the members of a union in a location
 
 
-def _explain(
+def _explain_error(
     error: ValidationError, document: Document, changed_keys: dict[str, str], known_keys: Sequence[str]
 ) -> ConfigError:
     """Return the first problem as one line with file, line and key, or with the setting that caused it."""
@@ -154,5 +154,5 @@ def _explain(
         input_text = repr(first_error["input"])
         text = f"{first_error['msg']}, not {input_text if len(input_text) < 60 else input_text[:57] + '...'}"
     if location and location[0] in changed_keys:
-        return ConfigError(f"--set {changed_keys[str(location[0])]}: {dotted(location)}: {text}")
+        return ConfigError(f"--set {changed_keys[str(location[0])]}: {format_location(location)}: {text}")
     return document.error(location, text)

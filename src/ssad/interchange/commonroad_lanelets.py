@@ -17,7 +17,7 @@ from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, LaneType, SignalState
 from ssad.interchange import commonroad_xml as xml
-from ssad.interchange.commonroad_xml import Texts
+from ssad.interchange.commonroad_xml import TextReader
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -30,7 +30,7 @@ _MIN_STEP = 1e-3  # m between points of a lane; closer ones are dropped
 
 
 @dataclass(frozen=True)
-class ReadLanes:
+class ImportedLanes:
     """The roads of a CommonRoad file.
 
     Attributes:
@@ -46,14 +46,14 @@ class ReadLanes:
     cycles: int
 
 
-def read_lanes(root: Element, texts: Texts, name: str, lost: Counter[str]) -> ReadLanes:
+def read_lanes(root: Element, texts: TextReader, name: str, omissions: Counter[str]) -> ImportedLanes:
     """Build the lane graph of a file's lanelets.
 
     Args:
         root: The document.
         texts: Reads its texts.
         name: Name of the town.
-        lost: Counter of the features that are not carried over.
+        omissions: Counter of the features that are not carried over.
 
     Raises:
         FormatError: Lanelets are broken, or have dangling references.
@@ -61,9 +61,9 @@ def read_lanes(root: Element, texts: Texts, name: str, lost: Counter[str]) -> Re
     """
     elements = root.findall("lanelet")
     if not elements:
-        raise texts.fail("commonRoad", "it has no lanelet")
+        raise texts.error("commonRoad", "it has no lanelet")
     if len(elements) > MAX_LANELETS:
-        raise texts.fail("commonRoad", f"{len(elements)} lanelets, at most {MAX_LANELETS}")
+        raise texts.error("commonRoad", f"{len(elements)} lanelets, at most {MAX_LANELETS}")
     types_by_element = {
         id(lanelet): [type_element.text or "" for type_element in lanelet.iterfind("laneletType")]
         for lanelet in elements
@@ -71,28 +71,33 @@ def read_lanes(root: Element, texts: Texts, name: str, lost: Counter[str]) -> Re
     crosswalks = [lanelet for lanelet in elements if "crosswalk" in types_by_element[id(lanelet)]]
     lanelets = [lanelet for lanelet in elements if "crosswalk" not in types_by_element[id(lanelet)]]
     if not lanelets:
-        raise texts.fail("commonRoad", "it has no lanelet but crosswalks")
+        raise texts.error("commonRoad", "it has no lanelet but crosswalks")
     lane_of: dict[int, int] = {}
     for lane_index, element in enumerate(lanelets):
         lanelet_id = texts.whole(element.get("id"), element, "id")
         if lanelet_id in lane_of:
-            raise texts.fail(element, "there are two of this id")
+            raise texts.error(element, "there are two of this id")
         lane_of[lanelet_id] = lane_index
-    return _Lanes(texts, lost, lanelets, lane_of, [types_by_element[id(lanelet)] for lanelet in lanelets]).read(
-        root, name, crosswalks
-    )
+    return _LaneletReader(
+        texts, omissions, lanelets, lane_of, [types_by_element[id(lanelet)] for lanelet in lanelets]
+    ).read(root, name, crosswalks)
 
 
-class _Lanes:
+class _LaneletReader:
     def __init__(
-        self, texts: Texts, lost: Counter[str], lanes: list[Element], lane_of: dict[int, int], kinds: list[list[str]]
+        self,
+        texts: TextReader,
+        omissions: Counter[str],
+        lanes: list[Element],
+        lane_of: dict[int, int],
+        kinds: list[list[str]],
     ) -> None:
-        self.texts, self.lost, self.lanes, self.lane_of, self.kinds = texts, lost, lanes, lane_of, kinds
+        self.texts, self.omissions, self.lanes, self.lane_of, self.kinds = texts, omissions, lanes, lane_of, kinds
 
-    def read(self, root: Element, name: str, walks: list[Element]) -> ReadLanes:
+    def read(self, root: Element, name: str, walks: list[Element]) -> ImportedLanes:
         shapes = self.shapes = [self._shape(element) for element in self.lanes]
         count = len(shapes)
-        left, right, road, direction = self._beside()
+        left, right, road, direction = self._adjacent_lanes()
         successors = [self._lane_refs(element, "successor") for element in self.lanes]
         for lane_index, element in enumerate(self.lanes):
             for predecessor in self._lane_refs(element, "predecessor"):
@@ -100,7 +105,7 @@ class _Lanes:
                 if lane_index not in successors[predecessor]:
                     successors[predecessor].append(lane_index)
         junction = self._junctions(root, successors)
-        markings = [self._marks(element) for element in self.lanes]
+        markings = [self._markings(element) for element in self.lanes]
         speed_limits = self._limits(root)
         outlines = [
             np.concatenate(
@@ -136,22 +141,22 @@ class _Lanes:
             **self._signs(root, shapes, "trafficSign"),
             **self._signals(root, shapes, junction, successors),
         )
-        return ReadLanes(self.graph, self.lane_of, self.states, self.cycles)
+        return ImportedLanes(self.graph, self.lane_of, self.states, self.cycles)
 
     def _shape(self, element: Element) -> F64:
         """Return [N, 6] x, y, z, yaw, width, s of a lanelet."""
         sides = [self.texts.points(element.find(tag), element, tag) for tag in ("leftBound", "rightBound")]
         if min(len(side) for side in sides) < 2:
-            raise self.texts.fail(element, "a bound has fewer than two points")
+            raise self.texts.error(element, "a bound has fewer than two points")
         if len(sides[0]) != len(sides[1]):
-            self.lost["lanelets whose bounds have different numbers of points are resampled"] += 1
+            self.omissions["lanelets whose bounds have different numbers of points are resampled"] += 1
             sides = [_resample(side, max(map(len, sides))) for side in sides]
         middle = 0.5 * (sides[0] + sides[1])
         spacing = np.hypot(*np.diff(middle[:, :2], axis=0).T)
         is_distinct = np.concatenate([[True], spacing > _MIN_STEP])
         sides, middle = [side[is_distinct] for side in sides], middle[is_distinct]
         if len(middle) < 2:
-            raise self.texts.fail(element, "its points all lie in one place")
+            raise self.texts.error(element, "its points all lie in one place")
         tangent = np.gradient(middle[:, :2], axis=0)
         path_heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         across = (sides[0] - sides[1])[:, :2]
@@ -172,11 +177,11 @@ class _Lanes:
         lanes = []
         for lanelet_id in self.texts.ids(element, tag):
             if lanelet_id not in self.lane_of:
-                raise self.texts.fail(element, f"{tag} {lanelet_id}: there is no such lanelet")
+                raise self.texts.error(element, f"{tag} {lanelet_id}: there is no such lanelet")
             lanes.append(self.lane_of[lanelet_id])
         return lanes
 
-    def _beside(self) -> tuple[Any, Any, Any, Any]:
+    def _adjacent_lanes(self) -> tuple[Any, Any, Any, Any]:
         """Return the lanes to the left and right, and the road (lanes side by side) and direction of each lane."""
         count = len(self.lanes)
         sides = np.full((2, count), -1, np.int32)
@@ -202,7 +207,7 @@ class _Lanes:
                         pending.append(neighbour)
         return sides[0], sides[1], road, -direction
 
-    def _marks(self, element: Element) -> tuple[Marking, Marking]:
+    def _markings(self, element: Element) -> tuple[Marking, Marking]:
         markings = []
         for tag in ("leftBound", "rightBound"):
             marking_name = element.findtext(f"{tag}/lineMarking") or "no_marking"
@@ -241,11 +246,11 @@ class _Lanes:
                 if sign_id in limit_by_sign
             ]
             if speeds and not min(speeds) > 0.0:
-                raise self.texts.fail(element, f"its speed limit is {min(speeds):g} m/s")
+                raise self.texts.error(element, f"its speed limit is {min(speeds):g} m/s")
             speed_limits[lane_index] = min(speeds, default=SPEED)
         return speed_limits
 
-    def _ruled(self, tag: str) -> dict[int, list[tuple[int, float | None]]]:
+    def _lanes_by_rule(self, tag: str) -> dict[int, list[tuple[int, float | None]]]:
         """Return id of a sign or light -> lanes that refer to it, and the arc length of their stop line or None."""
         lanes_by_id: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
         for lane, element in enumerate(self.lanes):
@@ -267,7 +272,7 @@ class _Lanes:
         return xy[0] if len(xy) else fallback
 
     def _signs(self, root: Element, shapes: list[F64], tag: str) -> dict[str, Any]:
-        lanes_by_sign = self._ruled(f"{tag}Ref")
+        lanes_by_sign = self._lanes_by_rule(f"{tag}Ref")
         sign_kinds: list[SignKind] = []
         positions, yaws, rule_rows = [], [], []
         for sign in root.iterfind(tag):
@@ -285,7 +290,7 @@ class _Lanes:
             )
             unsupported = sorted(set(sign_names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
             for name in unsupported:
-                self.lost[f"traffic sign {name[:20]}"] += 1
+                self.omissions[f"traffic sign {name[:20]}"] += 1
             if kind is None or not lanes:
                 continue
             end = shapes[lanes[0][0]][-1]
@@ -305,7 +310,7 @@ class _Lanes:
         }
 
     def _signals(self, root: Element, shapes: list[F64], junction: Any, follow: list[list[int]]) -> dict[str, Any]:
-        lanes_by_light = self._ruled("trafficLightRef")
+        lanes_by_light = self._lanes_by_rule("trafficLightRef")
         self.states: dict[int, SignalState] = {}
         self.cycles = 0
         signal_rows: list[tuple[float, ...]] = []
@@ -315,7 +320,7 @@ class _Lanes:
             lanes = lanes_by_light.get(self.texts.whole(light.get("id"), light, "id"), [])
             cycle = self._cycle(light)
             if not lanes:
-                self.lost["traffic lights that no lanelet refers to"] += 1
+                self.omissions["traffic lights that no lanelet refers to"] += 1
                 continue
             signal_number = len(signal_rows)
             if len({state for _, state in cycle[:-1]}) == 1:
@@ -350,7 +355,7 @@ class _Lanes:
         for part in light.iterfind("cycle/cycleElement"):
             colour = (part.findtext("color") or "").strip()
             if colour not in xml.STATE_OF:
-                raise self.texts.fail(light, f"'{colour[:40]}' is no colour; known: {', '.join(xml.STATE_OF)}")
+                raise self.texts.error(light, f"'{colour[:40]}' is no colour; known: {', '.join(xml.STATE_OF)}")
             parts.append((self.texts.whole(part.findtext("duration"), light, "duration"), colour))
         if (light.findtext("active") or "").strip() == "false" or not parts:
             parts = [(1, "inactive")]

@@ -42,13 +42,13 @@ def write_lanes(
     Returns:
         The next free id, and what is not carried over.
     """
-    ids = _Numbers(number)
-    speed_sign_ids = {speed: ids.new() for speed in sorted({float(limit) for limit in graph.speed_limit})}
+    ids = _IdCounter(number)
+    speed_sign_ids = {speed: ids.next_id() for speed in sorted({float(limit) for limit in graph.speed_limit})}
     signal_indices = [
         index for index in range(len(graph.signal_phase)) if not graph.signal_virtual[index] or index in forced
     ]
-    light_ids = {index: ids.new() for index in signal_indices}
-    sign_ids = {index: ids.new() for index in range(len(graph.sign_kind))}
+    light_ids = {index: ids.next_id() for index in signal_indices}
+    sign_ids = {index: ids.next_id() for index in range(len(graph.sign_kind))}
     lane_lights: dict[int, list[tuple[float, int]]] = defaultdict(list)
     lane_signs: dict[int, list[tuple[float, int]]] = defaultdict(list)
     for signal, lane, s in zip(graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s, strict=True):
@@ -57,7 +57,7 @@ def write_lanes(
     for sign_index, lane, s in zip(graph.rule_sign.tolist(), graph.rule_lane.tolist(), graph.rule_s, strict=True):
         lane_signs[lane].append((float(s), sign_ids[sign_index]))
     with_heights = float(np.ptp(graph.z)) > FLAT
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         _lanelet(
             root,
             graph,
@@ -68,7 +68,7 @@ def write_lanes(
             with_heights,
         )
     for index in range(len(graph.crosswalk_offset) - 1):
-        _crosswalk(root, graph, index, ids.new())
+        _crosswalk(root, graph, index, ids.next_id())
     for speed, sign_index in speed_sign_ids.items():
         _sign(root, sign_index, xml.TOP_SPEED, graph.xy[0].tolist(), speed)
     for index, sign_index in sign_ids.items():
@@ -87,11 +87,11 @@ def write_lanes(
     return ids.next, omissions
 
 
-class _Numbers:
+class _IdCounter:
     def __init__(self, first: int) -> None:
         self.next = first
 
-    def new(self) -> int:
+    def next_id(self) -> int:
         self.next += 1
         return self.next - 1
 
@@ -126,7 +126,7 @@ def _lanelet(  # noqa: PLR0917
             add_element(element, tag, ref=neighbour + 1)
     for tag, neighbour in (("adjacentLeft", int(graph.left[lane])), ("adjacentRight", int(graph.right[lane]))):
         if neighbour >= 0:
-            same_direction = graph.same_direction(lane, neighbour)
+            same_direction = graph.is_same_direction(lane, neighbour)
             add_element(element, tag, ref=neighbour + 1, drivingDir="same" if same_direction else "opposite")
     if stops := lights or signs:
         x, y, yaw, width = graph.at(lane, stops[0][0])
@@ -188,7 +188,7 @@ def _light(  # noqa: PLR0917
     add_element(light, "active", True)
 
 
-def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
+def _intersections(root: Element, graph: LaneGraph, numbers: _IdCounter) -> None:
     for junction in sorted({int(lane_junction) for lane_junction in graph.junction} - {-1}):
         inner_lanes = np.flatnonzero((graph.junction == junction) & (graph.kind == LaneType.DRIVING)).tolist()
         lanes_by_entry: dict[int, list[int]] = defaultdict(list)
@@ -198,9 +198,9 @@ def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
                     lanes_by_entry[entry_lane].append(lane)
         if not lanes_by_entry:
             continue
-        element = add_element(root, "intersection", id=numbers.new())
+        element = add_element(root, "intersection", id=numbers.next_id())
         for entry_lane, following in sorted(lanes_by_entry.items()):
-            incoming = add_element(element, "incoming", id=numbers.new())
+            incoming = add_element(element, "incoming", id=numbers.next_id())
             add_element(incoming, "incomingLanelet", ref=entry_lane + 1)
             turns = {lane: turn_of(graph, lane) for lane in following}
             for tag, low, high in (

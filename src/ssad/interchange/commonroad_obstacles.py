@@ -11,7 +11,7 @@ import numpy as np
 
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import Actor, AgentKind, EpisodeLimits, Pose
-from ssad.interchange.commonroad_xml import KINDS_OF, STEP, Texts
+from ssad.interchange.commonroad_xml import KINDS_OF, STEP, TextReader
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
 
@@ -22,11 +22,11 @@ OWN: Final = 1.5  # m from the ego's start within which an obstacle is the ego's
 _VEHICLES = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE, AgentKind.BICYCLE)
 
 
-class Obstacles:
-    """The obstacles of a document whose steps last `dt` s; inexact conversions are counted in `lost`."""
+class ObstacleReader:
+    """The obstacles of a document whose steps last `dt` s; inexact conversions are counted in `omissions`."""
 
-    def __init__(self, texts: Texts, lost: Counter[str], dt: float) -> None:
-        self.texts, self.lost, self.dt = texts, lost, dt
+    def __init__(self, texts: TextReader, omissions: Counter[str], dt: float) -> None:
+        self.texts, self.omissions, self.dt = texts, omissions, dt
 
     def read(self, root: Element, start: Pose, limits: EpisodeLimits) -> tuple[Actor, ...]:
         """Return the actors in the order of their ids.
@@ -42,22 +42,24 @@ class Obstacles:
         end_time = min(limits.max_steps * STEP, limits.max_time)
         actors: dict[int, tuple[float, Actor]] = {}
         known_ids: set[int] = set()
-        for tag, convert in (("staticObstacle", self._static), ("dynamicObstacle", self._dynamic)):
+        for tag, convert in (("staticObstacle", self._static_actor), ("dynamicObstacle", self._dynamic_actor)):
             for element in root.iterfind(tag):
                 obstacle_id = self.texts.whole(element.get("id"), element, "id")
                 if obstacle_id in known_ids:
-                    raise self.texts.fail(element, "there are two of this id")
+                    raise self.texts.error(element, "there are two of this id")
                 known_ids.add(obstacle_id)
                 actor = convert(element, end_time)
                 if actor is not None and self._is_ego(actor, start):
-                    self.lost["an obstacle that is the ego's own recording: it starts where the ego does"] += 1
+                    self.omissions["an obstacle that is the ego's own recording: it starts where the ego does"] += 1
                 elif actor is not None:
                     rows = np.array(actor.trajectory or [(0.0, actor.pose.x, actor.pose.y, 0.0)])
                     distance = float(np.hypot(rows[:, 1] - start.x, rows[:, 2] - start.y).min())
                     actors[obstacle_id] = distance, actor
         nearest_ids = sorted(actors, key=lambda obstacle_id: actors[obstacle_id][0])[: MAX_AGENTS - 1]
         if excess := len(actors) - len(nearest_ids):
-            self.lost[f"{excess} obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start"] += 1
+            self.omissions[
+                f"{excess} obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start"
+            ] += 1
         return tuple(actors[obstacle_id][1] for obstacle_id in sorted(nearest_ids))
 
     @staticmethod
@@ -76,19 +78,19 @@ class Obstacles:
         if is_static:
             kinds = _VEHICLES if type_name == "parkedVehicle" else (AgentKind.PROP,)
         if not kinds:
-            raise self.texts.fail(element, f"'{type_name[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
+            raise self.texts.error(element, f"'{type_name[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
         size = self._size(element)
         candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
         model = min(candidates, key=lambda candidate: abs(candidate.length - size[0]) + abs(candidate.width - size[1]))
         if max(abs(model.length - size[0]), abs(model.width - size[1])) > 0.01:
-            self.lost[f"the body of a {type_name} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{model.name}'"] += 1
+            self.omissions[f"the body of a {type_name} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{model.name}'"] += 1
         return type_name, model.name
 
     def _size(self, element: Element) -> tuple[float, float]:
         """Return length and width, m."""
         shape = element.find("shape")
         if shape is None or not len(shape):
-            raise self.texts.fail(element, "shape is missing")
+            raise self.texts.error(element, "shape is missing")
         outline = shape[0]
         if outline.tag == "rectangle":
             length, width = (
@@ -99,41 +101,41 @@ class Obstacles:
         elif outline.tag == "polygon":
             corners = self.texts.points(outline, element, "polygon")
             if len(corners) < 3:
-                raise self.texts.fail(element, "its shape is a polygon of fewer than 3 points")
+                raise self.texts.error(element, "its shape is a polygon of fewer than 3 points")
             length, width = np.ptp(corners[:, :2], axis=0).tolist()
         else:
-            raise self.texts.fail(element, f"its shape is a {outline.tag[:40]}, which is not read")
+            raise self.texts.error(element, f"its shape is a {outline.tag[:40]}, which is not read")
         if not (0.0 < length < 1e4 and 0.0 < width < 1e4):
-            raise self.texts.fail(element, f"its body is {length:g} x {width:g} m")
+            raise self.texts.error(element, f"its body is {length:g} x {width:g} m")
         if outline.tag != "rectangle" or outline.find("center") is not None or len(shape) > 1:
-            self.lost["bodies that are no rectangle about their middle"] += 1
+            self.omissions["bodies that are no rectangle about their middle"] += 1
         return length, width
 
-    def _static(self, element: Element, until: float) -> Actor | None:
+    def _static_actor(self, element: Element, until: float) -> Actor | None:
         type_name, model = self._body(element)
         state = element.find("initialState")
         if state is None:
-            raise self.texts.fail(element, "initialState is missing")
+            raise self.texts.error(element, "initialState is missing")
         return Actor(f"{type_name}-{element.get('id')}", model, self.pose(state, element))
 
-    def _dynamic(self, element: Element, until: float) -> Actor | None:
+    def _dynamic_actor(self, element: Element, until: float) -> Actor | None:
         type_name, model = self._body(element)
         start = element.find("initialState")
         if start is None:
-            raise self.texts.fail(element, "initialState is missing")
+            raise self.texts.error(element, "initialState is missing")
         name = f"{type_name}-{element.get('id')}"
         regions = element.findall("occupancySet/occupancy")
         if regions:
-            self.lost["occupancy sets: their middles are taken as a trajectory"] += 1
+            self.omissions["occupancy sets: their middles are taken as a trajectory"] += 1
         pose_by_time: dict[float, tuple[float, float, float]] = {}
         pose = self.pose(start, element)
         for state in (start, *element.findall("trajectory/state"), *regions):
             time = self.middle(state, "time", element, None) * self.dt
             last_time = max(pose_by_time, default=-1.0)
             if time < last_time:
-                raise self.texts.fail(element, f"time {time / self.dt:g} does not come after the one before it")
+                raise self.texts.error(element, f"time {time / self.dt:g} does not come after the one before it")
             if time == last_time:
-                self.lost["states of a step that has one already"] += 1
+                self.omissions["states of a step that has one already"] += 1
                 continue
             pose = self._middle_of(state, element, pose) if state.tag == "occupancy" else self.pose(state, element)
             pose_by_time[time] = pose.x, pose.y, pose.yaw
@@ -148,30 +150,32 @@ class Obstacles:
         """Return the pose of a state; of a region the middle."""
         position = state.find("position")
         if position is None or not len(position):
-            raise self.texts.fail(within, "position is missing")
+            raise self.texts.error(within, "position is missing")
         if position[0].tag == "point":
             x, y = self.texts.points(position, within, "position")[0, :2].tolist()
         else:
             centre = position[0].find("center")
             if centre is None:
-                raise self.texts.fail(within, f"a position that is a {position[0].tag[:40]} is not read")
+                raise self.texts.error(within, f"a position that is a {position[0].tag[:40]} is not read")
             x, y = (self.texts.number(centre.findtext(axis), within, f"position: {axis}") for axis in "xy")
-            self.lost["positions that are regions: their middle is taken"] += 1
+            self.omissions["positions that are regions: their middle is taken"] += 1
         return Pose(x, y, float(wrap_angle(self.middle(state, "orientation", within, None))))
 
-    def _middle_of(self, occupancy: Element, within: Element, before: Pose) -> Pose:
+    def _middle_of(self, occupancy: Element, within: Element, previous_pose: Pose) -> Pose:
         """The middle of an occupancy; without an orientation of its own it heads as the one before it."""
         shape = occupancy.find("shape")
         if shape is None or not len(shape):
-            raise self.texts.fail(within, "an occupancy without a shape")
+            raise self.texts.error(within, "an occupancy without a shape")
         if shape[0].tag == "polygon":
             corners = self.texts.points(shape[0], within, "occupancy")[:, :2]
             if len(corners) < 3:
-                raise self.texts.fail(within, "an occupancy is a polygon of fewer than 3 points")
-            return Pose(float(corners[:, 0].mean()), float(corners[:, 1].mean()), before.yaw)
+                raise self.texts.error(within, "an occupancy is a polygon of fewer than 3 points")
+            return Pose(float(corners[:, 0].mean()), float(corners[:, 1].mean()), previous_pose.yaw)
         coordinates = [shape[0].findtext(f"center/{axis}", "0") for axis in "xy"]
         x, y = (self.texts.number(text, within, "occupancy: center") for text in coordinates)
-        yaw = self.texts.number(shape[0].findtext("orientation", repr(before.yaw)), within, "occupancy: orientation")
+        yaw = self.texts.number(
+            shape[0].findtext("orientation", repr(previous_pose.yaw)), within, "occupancy: orientation"
+        )
         return Pose(x, y, float(wrap_angle(yaw)))
 
     def middle(self, state: Element, tag: str, within: Element, default: float | None) -> float:
@@ -181,5 +185,5 @@ class Obstacles:
             return default
         low, high = self.texts.value(element, within, tag)
         if low != high:
-            self.lost[f"intervals of {tag}: their middle is taken"] += 1
+            self.omissions[f"intervals of {tag}: their middle is taken"] += 1
         return 0.5 * (low + high)

@@ -1,7 +1,7 @@
 """CommonRoad XML 2020a as a scenario: obstacles replay their trajectories, and the ego gets the planning problem.
 
 If the lanelets are those of an existing town, the scenario takes place in that town; else they become a town.
-Features without a counterpart are listed in `ReadCommonRoad.lost`.
+Features without a counterpart are listed in `ImportedCommonRoad.omissions`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import F64, EpisodeLimits, LaneType, Pose, Route, Scenario, SignalPlan
-from ssad.interchange.commonroad_lanelets import ReadLanes, read_lanes
-from ssad.interchange.commonroad_obstacles import Obstacles
+from ssad.interchange.commonroad_lanelets import ImportedLanes, read_lanes
+from ssad.interchange.commonroad_obstacles import ObstacleReader
 from ssad.interchange.commonroad_writer import benchmark_map
-from ssad.interchange.commonroad_xml import STEP, VERSION, Texts, own_values
+from ssad.interchange.commonroad_xml import STEP, VERSION, TextReader, own_values
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
@@ -41,23 +41,23 @@ ALIKE: Final = 0.01  # m, largest distance between lanes of a file and of a town
 
 
 @dataclass(frozen=True)
-class ReadCommonRoad:
+class ImportedCommonRoad:
     """A scenario from a CommonRoad file.
 
     Attributes:
         scenario: The scenario.
         graph: Its town.
-        known: Whether the town can be loaded by its name; else the graph must be stored.
-        lost: Features of the file that are not carried over, one line each.
+        is_known_town: Whether the town can be loaded by its name; else the graph must be stored.
+        omissions: Features of the file that are not carried over, one line each.
     """
 
     scenario: Scenario
     graph: LaneGraph
-    known: bool
-    lost: tuple[str, ...]
+    is_known_town: bool
+    omissions: tuple[str, ...]
 
 
-def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None = None) -> ReadCommonRoad:
+def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None = None) -> ImportedCommonRoad:
     """Read the scenario of a file.
 
     Args:
@@ -88,22 +88,22 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
 
 class _Reader:
     def __init__(self, location: str, root: Element) -> None:
-        self.root, self.texts = root, Texts(location)
-        self.lost: Counter[str] = Counter()
-        self.own = own_values(root.get("source", ""))
+        self.root, self.texts = root, TextReader(location)
+        self.omissions: Counter[str] = Counter()
+        self.own_values = own_values(root.get("source", ""))
         self.dt = self.texts.number(root.get("timeStepSize"), root, "timeStepSize")
         if not 0.0 < self.dt <= 10.0:
-            raise self.texts.fail(root, f"timeStepSize is {self.dt:g} s")
-        self.obstacles = Obstacles(self.texts, self.lost, self.dt)
+            raise self.texts.error(root, f"timeStepSize is {self.dt:g} s")
+        self.obstacles = ObstacleReader(self.texts, self.omissions, self.dt)
 
-    def read(self, stem: str, town: str, map_name: str | None) -> ReadCommonRoad:
+    def read(self, stem: str, town: str, map_name: str | None) -> ImportedCommonRoad:
         """Return the scenario, checked, and the features that are not carried over."""
         lanes, graph, is_known, town_name = self._town(town, map_name)
         problem = self._problem()
         start, speed = self._start(problem)
         limits, goal, target_speed = self._goal(problem, lanes, speed)
         route, ego_route = self._route(graph, start, goal)
-        stored_name = scenario_name(self.own.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
+        stored_name = scenario_name(self.own_values.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
         scenario = Scenario(
             name=stored_name or scenario_name(stem) or "imported",
             type="Custom",
@@ -112,32 +112,32 @@ class _Reader:
             parameters=start_parameters(ego_route, start, speed, digits=6),
             limits=limits,
             target_speed=target_speed,
-            group=self.own.get("group", ""),
+            group=self.own_values.get("group", ""),
             actors=self.obstacles.read(self.root, start, limits),
             signals=self._signals(lanes, graph, ego_route, limits),
             source=f"CommonRoad {Path(self.texts.location).name}",
         )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
-                self.lost[tag] += count
+                self.omissions[tag] += count
         build_episode(scenario, graph, seed=0)  # reports any remaining error of the scenario
-        lost = tuple(
+        omissions = tuple(
             f"{message}{f' ({occurrences} times)' if occurrences > 1 else ''}"
-            for message, occurrences in self.lost.items()
+            for message, occurrences in self.omissions.items()
         )
-        return ReadCommonRoad(scenario, graph, is_known, lost)
+        return ImportedCommonRoad(scenario, graph, is_known, omissions)
 
     # ------------------------------------------------------------ the town
 
-    def _town(self, town: str, map_name: str | None) -> tuple[ReadLanes, LaneGraph, bool, str]:
+    def _town(self, town: str, map_name: str | None) -> tuple[ImportedLanes, LaneGraph, bool, str]:
         """Return the file's lanes, the town, whether the town can be loaded by name, and its name."""
-        lanes = read_lanes(self.root, self.texts, town, self.lost)
+        lanes = read_lanes(self.root, self.texts, town, self.omissions)
         if map_name is not None:
             is_known = is_town(map_name)
             graph = load_town(map_name)
             return lanes, (graph if is_known else replace(graph, name=town)), is_known, (map_name if is_known else town)
-        if is_town(self.own.get("town", "")):
-            graph = load_town(self.own["town"])
+        if is_town(self.own_values.get("town", "")):
+            graph = load_town(self.own_values["town"])
             if _same_lanes(graph, lanes.graph):
                 return lanes, graph, True, graph.name
         label = self.root.get("benchmarkID", "").partition("_")[2].partition("-")[0]
@@ -145,10 +145,10 @@ class _Reader:
             if benchmark_map(name) == label and _same_lanes(load_town(name), lanes.graph):
                 return lanes, load_town(name), True, name
         if lanes.cycles:
-            self.lost[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
+            self.omissions[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
         return lanes, lanes.graph, False, town
 
-    def _signals(self, lanes: ReadLanes, graph: LaneGraph, line: Route, limits: EpisodeLimits) -> SignalPlan:
+    def _signals(self, lanes: ImportedLanes, graph: LaneGraph, line: Route, limits: EpisodeLimits) -> SignalPlan:
         """The plan that forces just the lights that always show the same."""
         if not lanes.states:
             return SignalPlan()
@@ -161,11 +161,11 @@ class _Reader:
             if lanes_by_signal.get(signal) in signal_by_lanes
         }
         end_time = max(60.0, limits.max_time)
-        if "signals_until" in self.own:
-            end_time = self.texts.number(self.own["signals_until"], self.root, "source: signals_until")
+        if "signals_until" in self.own_values:
+            end_time = self.texts.number(self.own_values["signals_until"], self.root, "source: signals_until")
         plan = plan_of(graph, line, forced_states, end_time) if len(forced_states) == len(lanes.states) else None
         if plan is None:
-            self.lost[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
+            self.omissions[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
 
     # ------------------------------------------------------------ the ego
@@ -173,78 +173,78 @@ class _Reader:
     def _problem(self) -> Element:
         problems = self.root.findall("planningProblem")
         if not problems:
-            raise self.texts.fail("commonRoad", "it has no planningProblem: nothing says where the ego goes")
+            raise self.texts.error("commonRoad", "it has no planningProblem: nothing says where the ego goes")
         if len(problems) > 1:
-            self.lost[f"{len(problems) - 1} more planning problems: the first is driven"] += 1
+            self.omissions[f"{len(problems) - 1} more planning problems: the first is driven"] += 1
         return problems[0]
 
     def _start(self, problem: Element) -> tuple[Pose, float]:
         state = problem.find("initialState")
         if state is None:
-            raise self.texts.fail(problem, "initialState is missing")
+            raise self.texts.error(problem, "initialState is missing")
         pose = self.obstacles.pose(state, problem)
         speed = self.obstacles.middle(state, "velocity", problem, 0.0)
         if speed < 0.0:
-            raise self.texts.fail(problem, f"it starts with {speed:g} m/s")
+            raise self.texts.error(problem, f"it starts with {speed:g} m/s")
         if self.obstacles.middle(state, "time", problem, 0.0) != 0.0:
-            self.lost["the step at which the planning problem begins: it is step 0"] += 1
+            self.omissions["the step at which the planning problem begins: it is step 0"] += 1
         return pose, min(speed, MAX_SPEED)
 
-    def _goal(self, problem: Element, lanes: ReadLanes, speed: float) -> tuple[EpisodeLimits, Pose | None, float]:
+    def _goal(self, problem: Element, lanes: ImportedLanes, speed: float) -> tuple[EpisodeLimits, Pose | None, float]:
         """Return the limits, the goal pose, and the target speed."""
         goals = problem.findall("goalState")
         if not goals:
-            raise self.texts.fail(problem, "goalState is missing")
+            raise self.texts.error(problem, "goalState is missing")
         if len(goals) > 1:
-            self.lost[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
+            self.omissions[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
         goal = goals[0]
         begin_step, end_step = self.texts.value(goal.find("time"), problem, "goalState: time")
         steps = round(end_step * self.dt / STEP)
         if steps < 1:
-            raise self.texts.fail(problem, f"its goal is to be reached at step {end_step:g}")
+            raise self.texts.error(problem, f"its goal is to be reached at step {end_step:g}")
         if begin_step > 0.0:
-            self.lost["the earliest time of the goal"] += 1
+            self.omissions["the earliest time of the goal"] += 1
         if goal.find("orientation") is not None:
-            self.lost["the orientation of the goal"] += 1
+            self.omissions["the orientation of the goal"] += 1
         limits = EpisodeLimits(max_steps=steps, max_time=max(EpisodeLimits().max_time, steps * STEP))
-        if self.own.get("contact") in ("end", "count", "remove"):
-            limits = replace(limits, contact=self.own["contact"])  # type: ignore[arg-type]
-        if "max_distance" in self.own:
-            max_distance = self.texts.number(self.own["max_distance"], self.root, "source: max_distance")
+        if self.own_values.get("contact") in ("end", "count", "remove"):
+            limits = replace(limits, contact=self.own_values["contact"])  # type: ignore[arg-type]
+        if "max_distance" in self.own_values:
+            max_distance = self.texts.number(self.own_values["max_distance"], self.root, "source: max_distance")
             limits = replace(limits, max_distance=max(max_distance, 1.0))
         target_speed = Scenario.target_speed
         if (velocity := goal.find("velocity")) is not None:
             min_speed, target_speed = self.texts.value(velocity, problem, "goalState: velocity")
             if min_speed > 0.0:
-                self.lost["the least speed at the goal"] += 1
+                self.omissions["the least speed at the goal"] += 1
         elif speed > 1.0:
             target_speed = speed
         if not 0.1 <= target_speed <= MAX_SPEED:
             target_speed = min(max(target_speed, Scenario.target_speed), MAX_SPEED)
-            self.lost[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
+            self.omissions[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
         return limits, self._region(goal.find("position"), problem, lanes), target_speed
 
-    def _region(self, position: Element | None, problem: Element, lanes: ReadLanes) -> Pose | None:
+    def _region(self, position: Element | None, problem: Element, lanes: ImportedLanes) -> Pose | None:
         """Return the middle of a goal region; None if there is none."""
         if position is None or not len(position):
             return None
         if len(position) > 1:
-            self.lost["more than one goal region: the first is the goal"] += 1
+            self.omissions["more than one goal region: the first is the goal"] += 1
         region = position[0]
         if region.tag == "lanelet":
             lanelet_id = self.texts.whole(region.get("ref"), problem, "goalState: lanelet")
             if lanelet_id not in lanes.lane_of:
-                raise self.texts.fail(problem, f"its goal is lanelet {lanelet_id}, which is not there")
+                raise self.texts.error(problem, f"its goal is lanelet {lanelet_id}, which is not there")
             lane = lanes.lane_of[lanelet_id]
             x, y, yaw, _ = lanes.graph.at(lane, max(float(lanes.graph.length[lane]) - 1.0, 0.0))
             return Pose(x, y, yaw)
         if region.tag == "polygon":
             corners = self.texts.points(region, problem, "goalState: polygon")
             if len(corners) < 3:
-                raise self.texts.fail(problem, "its goal is a polygon of fewer than 3 points")
+                raise self.texts.error(problem, "its goal is a polygon of fewer than 3 points")
             return Pose(*corners[:, :2].mean(0).tolist())
         if region.tag not in ("circle", "rectangle"):
-            raise self.texts.fail(problem, f"its goal is a {region.tag[:40]}, which is not read")
+            raise self.texts.error(problem, f"its goal is a {region.tag[:40]}, which is not read")
         x, y = (
             self.texts.number(region.findtext(f"center/{axis}"), problem, f"goalState: center: {axis}") for axis in "xy"
         )
@@ -253,8 +253,8 @@ class _Reader:
     def _route(self, graph: LaneGraph, start: Pose, goal: Pose | None) -> tuple[tuple[Pose, ...], Route]:
         """Return the key points of the ego's route, and the route."""
         if goal is None:
-            self.lost[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
-            return self._ahead(graph, start)
+            self.omissions[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
+            return self._route_ahead(graph, start)
         try:
             ego_route = route_along(graph, (start, (goal.x, goal.y)))
             route = start, Pose(goal.x, goal.y, float(wrap_angle(ego_route.yaw[-1])))
@@ -262,10 +262,10 @@ class _Reader:
         except RouteError as error:
             if _lane_under(graph, start) is None or "no way" not in str(error):
                 raise RouteError(f"{self.texts.location}: the way of the ego: {error}") from None
-        self.lost[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
-        return self._ahead(graph, start)
+        self.omissions[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
+        return self._route_ahead(graph, start)
 
-    def _ahead(self, graph: LaneGraph, start: Pose) -> tuple[tuple[Pose, ...], Route]:
+    def _route_ahead(self, graph: LaneGraph, start: Pose) -> tuple[tuple[Pose, ...], Route]:
         """Return the route along the lane under the ego, straight on where lanes diverge."""
         place = _lane_under(graph, start)
         if place is None:
@@ -295,7 +295,7 @@ def _lane_under(graph: LaneGraph, pose: Pose) -> LanePosition | None:
 
 def _same_lanes(town: LaneGraph, lanes: LaneGraph) -> bool:
     """Return True if the lanes of a file are those of a town."""
-    is_same_layout = town.lanes == lanes.lanes and np.array_equal(town.kind, lanes.kind)
+    is_same_layout = town.lane_count == lanes.lane_count and np.array_equal(town.kind, lanes.kind)
     start_points: list[F64] = (
         [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, lanes)] if is_same_layout else []
     )

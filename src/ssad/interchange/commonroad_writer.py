@@ -59,7 +59,7 @@ class _Writer:
         self.episode, self.graph, self.dt = episode, graph, _fitting_step(episode, dt)
         limits = episode.limits
         self.steps = max(1, round(min(limits.max_steps * dt, limits.max_time) / self.dt))
-        self.lost: list[str] = []
+        self.omissions: list[str] = []
 
     def write(self, number: int) -> tuple[str, tuple[str, ...]]:
         episode, scenario = self.episode, self.episode.scenario
@@ -91,27 +91,29 @@ class _Writer:
         for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
             add_element(location, tag, value)
         add_element(add_element(root, "scenarioTags"), "simulated")
-        first_free_id = self.graph.lanes + 1
-        first_id, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id)
-        self.lost += lost
+        first_free_id = self.graph.lane_count + 1
+        first_id, omission_lines = write_lanes(
+            root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id
+        )
+        self.omissions += omission_lines
         if episode.signal_override and episode.override_until < self.steps * self.dt:
-            self.lost.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
+            self.omissions.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
         others = list(enumerate(episode.agents[1:], first_id))  # ids in the order of the agents
         for obstacle_id, agent in others:
-            if self._stands(agent):
+            if self._is_static(agent):
                 self._static(root, obstacle_id, agent)
         for obstacle_id, agent in others:
-            if not self._stands(agent):
+            if not self._is_static(agent):
                 self._dynamic(root, obstacle_id, agent)
         if len(episode.agents) > 1:
-            self.lost.append("names of actors: obstacles have numbers")
+            self.omissions.append("names of actors: obstacles have numbers")
         self._problem(root, first_id + len(others))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
-        return text, tuple(self.lost)
+        return text, tuple(self.omissions)
 
     @staticmethod
-    def _stands(agent: EpisodeAgent) -> bool:
+    def _is_static(agent: EpisodeAgent) -> bool:
         """Return whether an agent is a static obstacle: a parked vehicle or a prop."""
         return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
 
@@ -129,9 +131,9 @@ class _Writer:
         _state(add_element(obstacle, "initialState"), 0, agent.pose, 0.0)
 
     def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
-        first_step, rows = self._rows(agent)
+        first_step, rows = self._motion_rows(agent)
         if len(rows) < 2:
-            self.lost.append(f"{agent.name}, who is there for less than two steps")
+            self.omissions.append(f"{agent.name}, who is there for less than two steps")
             return
         obstacle = add_element(root, "dynamicObstacle", id=number)
         add_element(obstacle, "type", TYPES[model(agent.model).kind])
@@ -149,7 +151,7 @@ class _Writer:
         for state in states[1:]:
             _state(add_element(trajectory, "state"), *state)
 
-    def _rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
+    def _motion_rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
         """Return the first step, and x, y, yaw [T, 3] at each step at which an agent exists."""
         if not agent.trajectory:
             return 0, np.tile([agent.pose.x, agent.pose.y, agent.pose.yaw], (self.steps + 1, 1))
@@ -181,20 +183,22 @@ class _Writer:
         add_element(centre, "x", goal_pose.x)
         add_element(centre, "y", goal_pose.y)
         _interval(add_element(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
-        self._check_way(ego, goal_pose)
+        self._check_route(ego, goal_pose)
 
-    def _check_way(self, ego: EpisodeAgent, end: Pose) -> None:
+    def _check_route(self, ego: EpisodeAgent, end: Pose) -> None:
         """Say what is lost where the shortest way to the goal is not the ego's route."""
         assert ego.route is not None
         try:
             shortest = route_along(self.graph, (ego.pose, end))
         except RouteError:
-            self.lost.append("the ego's route: its start is not where a route can begin")
+            self.omissions.append("the ego's route: its start is not where a route can begin")
             return
         if abs(shortest.length - ego.route.length) > 1.5:
-            self.lost.append("the ego's route: a planning problem has a goal alone, and the shortest way is another")
+            self.omissions.append(
+                "the ego's route: a planning problem has a goal alone, and the shortest way is another"
+            )
         elif len(shortest.xy) != len(ego.route.xy):
-            self.lost.append("where the ego's route begins: a planning problem begins where the ego is")
+            self.omissions.append("where the ego's route begins: a planning problem begins where the ego is")
 
 
 def _fitting_step(episode: Episode, dt: float) -> float:

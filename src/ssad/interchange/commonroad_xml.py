@@ -107,13 +107,13 @@ def points(parent: Element, rows: npt.ArrayLike) -> None:
             add_element(point, name, value)
 
 
-class Texts:
+class TextReader:
     """Reader of the numbers in a document's elements; errors name the file and the element with its id."""
 
     def __init__(self, location: str) -> None:
         self.location = location
 
-    def fail(self, element: Element | str, message: str) -> FormatError:
+    def error(self, element: Element | str, message: str) -> FormatError:
         """Return a FormatError that names the file and the element."""
         if isinstance(element, str):
             return FormatError(f"{self.location}: {element}: {message}")
@@ -123,20 +123,20 @@ class Texts:
     def number(self, text: str | None, element: Element, description: str) -> float:
         """A finite number. FormatError if the text is none."""
         if text is None:
-            raise self.fail(element, f"{description} is missing")
+            raise self.error(element, f"{description} is missing")
         try:
             value = float(text)
         except ValueError:
-            raise self.fail(element, f"{description} is '{text.strip()[:40]}', not a number") from None
+            raise self.error(element, f"{description} is '{text.strip()[:40]}', not a number") from None
         if not math.isfinite(value) or abs(value) > 1e9:
-            raise self.fail(element, f"{description} is '{text.strip()[:40]}', not a number that can be used")
+            raise self.error(element, f"{description} is '{text.strip()[:40]}', not a number that can be used")
         return value
 
     def whole(self, text: str | None, element: Element, description: str) -> int:
         """A whole number. FormatError if the text is none."""
         value = self.number(text, element, description)
         if value != int(value):
-            raise self.fail(element, f"{description} is '{(text or '').strip()[:40]}', not a whole number")
+            raise self.error(element, f"{description} is '{(text or '').strip()[:40]}', not a whole number")
         return int(value)
 
     def ids(self, element: Element, tag: str) -> list[int]:
@@ -146,7 +146,7 @@ class Texts:
     def points(self, element: Element | None, within: Element, description: str) -> F64:
         """Points [N, 3] under an element; z is 0 where it is not given."""
         if element is None:
-            raise self.fail(within, f"{description} is missing")
+            raise self.error(within, f"{description} is missing")
         rows = [
             [
                 self.number(point.findtext(axis, None if axis != "z" else "0"), within, f"{description}: {axis}")
@@ -159,7 +159,7 @@ class Texts:
     def value(self, element: Element | None, within: Element, description: str) -> tuple[float, float]:
         """An exact value or an interval, as its ends."""
         if element is None:
-            raise self.fail(within, f"{description} is missing")
+            raise self.error(within, f"{description} is missing")
         if (exact := element.findtext("exact")) is not None:
             value = self.number(exact, within, description)
             return value, value
@@ -168,7 +168,7 @@ class Texts:
             for bound_tag in ("intervalStart", "intervalEnd")
         )
         if low > high:
-            raise self.fail(within, f"{description}: an interval from {low:g} to {high:g}")
+            raise self.error(within, f"{description}: an interval from {low:g} to {high:g}")
         return low, high
 
 

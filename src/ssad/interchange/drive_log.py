@@ -22,7 +22,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.frozen import Rows, rounded_rows
+from ssad.scenarios.dynamic.frozen import Rows, round_rows
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
 from ssad.world.roads import is_town, load_town, route_along
@@ -60,14 +60,14 @@ class LoggedDrive:
     Attributes:
         scenario: The scenario, of type Custom.
         graph: Its town.
-        known: Whether the town can be loaded by its name; else the graph must be stored.
-        left_out: Objects of the log without an actor: category, or reason -> count.
+        is_known_town: Whether the town can be loaded by its name; else the graph must be stored.
+        omissions: Objects of the log without an actor: category, or reason -> count.
     """
 
     scenario: Scenario
     graph: LaneGraph
-    known: bool
-    left_out: Mapping[str, int]
+    is_known_town: bool
+    omissions: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +104,18 @@ def scenario_of_drive(
     scene_data = data.scene(scene)
     location = f"{data.root / data.version}: scene '{scene_data.record.name}'"
     start = scene_data.samples[0].timestamp
-    ego_poses = _ego(scene_data, start)
+    ego_poses = _ego_motion(scene_data, start)
     if len(ego_poses) < 2:
         raise ConfigError(f"{location}: it has no poses of the ego")
-    driven = ego_poses[ego_poses[:, 0] >= -0.25]
-    if float(np.hypot(*np.diff(driven[:, 1:3], axis=0).T).sum()) < LEAST_WAY:
+    path_length = ego_poses[ego_poses[:, 0] >= -0.25]
+    if float(np.hypot(*np.diff(path_length[:, 1:3], axis=0).T).sum()) < LEAST_WAY:
         raise ConfigError(f"{location}: the ego drives less than {LEAST_WAY:g} m; choose another scene")
     tracks, left_out = _tracks(scene_data, start)
     if not tracks:
         raise ConfigError(f"{location}: nothing is annotated that could be an actor; choose another scene")
-    tracks, left_out = _nearest(tracks, ego_poses, left_out)
-    graph, is_known = _town(scene_data, location, driven, tracks, town=town, map_name=map_name)
-    scenario = _scenario(scene_data, graph, driven, tracks, name or f"log/{scene_data.record.name}", data.version)
+    tracks, left_out = _nearest_tracks(tracks, ego_poses, left_out)
+    graph, is_known = _town(scene_data, location, path_length, tracks, town=town, map_name=map_name)
+    scenario = _scenario(scene_data, graph, path_length, tracks, name or f"log/{scene_data.record.name}", data.version)
     build_episode(scenario, graph, seed=0)
     return LoggedDrive(scenario, graph, is_known, left_out)
 
@@ -124,7 +124,7 @@ def _is_recorded_by_ssad(scene: SceneData) -> bool:
     return scene.log is not None and scene.log.vehicle == OURS
 
 
-def _ego(scene: SceneData, start: int) -> F64:
+def _ego_motion(scene: SceneData, start: int) -> F64:
     """Return time s since `start` us, x, y and yaw [T, 4] of the middle of the ego, from the poses of all sensors."""
     axle_offset = (
         0.0 if _is_recorded_by_ssad(scene) else AXLE_TO_MIDDLE
@@ -183,27 +183,27 @@ def model_of(category: str, size_lwh: F64) -> str | None:
     """
     for prefix, models in MODELS_OF.items():
         if category.startswith(prefix):
-            return min(models, key=lambda name: float(np.abs(_size(name) - size_lwh).sum()))
+            return min(models, key=lambda name: float(np.abs(_model_size(name) - size_lwh).sum()))
     return None
 
 
-def _size(model: str) -> F64:
+def _model_size(model: str) -> F64:
     body = MODELS[model]
     return np.array([body.length, body.width, body.height])
 
 
-def _nearest(tracks: Sequence[_Track], ego: F64, left_out: Counter[str]) -> tuple[list[_Track], Counter[str]]:
+def _nearest_tracks(tracks: Sequence[_Track], ego: F64, omissions: Counter[str]) -> tuple[list[_Track], Counter[str]]:
     """Return as many tracks as a scene can hold: those that come nearest to the logged ego."""
     max_tracks = MAX_AGENTS - 1
     if len(tracks) <= max_tracks:
-        return list(tracks), left_out
+        return list(tracks), omissions
     distances = []
     for track in tracks:
         ego_positions = np.stack([np.interp(track.rows[:, 0], ego[:, 0], ego[:, axis]) for axis in (1, 2)], 1)
         distances.append(float(np.hypot(*(track.rows[:, 1:3] - ego_positions).T).min()))
     track_indices = sorted(np.argsort(distances, kind="stable")[:max_tracks].tolist())
-    left_out = left_out + Counter({f"too many (a scene has room for {max_tracks})": len(tracks) - max_tracks})
-    return [tracks[track_index] for track_index in track_indices], left_out
+    omissions = omissions + Counter({f"too many (a scene has room for {max_tracks})": len(tracks) - max_tracks})
+    return [tracks[track_index] for track_index in track_indices], omissions
 
 
 def _town(
@@ -219,16 +219,16 @@ def _town(
         for town_name in (scene.log.location, scene.record.description.partition(",")[0]):
             if is_town(town_name):
                 return load_town(town_name), True
-    paths, speeds = [path[:, 1:3]], [_fastest(path)]
+    paths, speeds = [path[:, 1:3]], [_max_speed(path)]
     for track in tracks:
         displacement = float(np.hypot(*(track.rows[-1, 1:3] - track.rows[0, 1:3])))
         if displacement >= MOVED and track.model in (*CARS, *LARGE, "motorcycle"):
             paths.append(track.rows[:, 1:3])
-            speeds.append(_fastest(track.rows))
+            speeds.append(_max_speed(track.rows))
     return graph_of_paths(town, paths, speeds=[max(speed, 5.0) for speed in speeds]), False
 
 
-def _fastest(rows: F64) -> float:
+def _max_speed(rows: F64) -> float:
     """Return the highest speed of a track [T, 4] over half a second, m/s."""
     times = np.arange(rows[0, 0], rows[-1, 0] + 1e-6, 0.5)
     if len(times) < 2:
@@ -246,8 +246,8 @@ def _scenario(  # noqa: PLR0917
         route = route_along(graph, points)
     except RouteError as error:
         raise RouteError(f"scene '{scene.record.name}': the way of the ego: {error}") from None
-    driven = path[path[:, 0] >= 0.0, 1:3]
-    route_distance = float(np.hypot(*np.moveaxis(driven[:, None] - route.xy[None], -1, 0)).min(1).max())
+    path_length = path[path[:, 0] >= 0.0, 1:3]
+    route_distance = float(np.hypot(*np.moveaxis(path_length[:, None] - route.xy[None], -1, 0)).min(1).max())
     if route_distance > OFF:
         raise RouteError(
             f"scene '{scene.record.name}': the way of the ego is up to {route_distance:.1f} m "
@@ -271,7 +271,7 @@ def _scenario(  # noqa: PLR0917
         actors=tuple(_actor(track) for track in tracks),
         signals=SignalPlan("green", "red", until=steps * STEP),  # a log does not record the states of signals
         limits=EpisodeLimits(max_steps=steps, max_time=round(steps * STEP, 1)),
-        target_speed=round(float(np.clip(_fastest(path), 3.0, 60.0)), 2),
+        target_speed=round(float(np.clip(_max_speed(path), 3.0, 60.0)), 2),
         group="log",
         source=f"nuScenes schema {version}, {scene.record.name}{location}",
     )
@@ -280,14 +280,14 @@ def _scenario(  # noqa: PLR0917
 def _key_points(path: F64) -> tuple[Pose, ...]:
     """Places of the ego at the start, each `KEY_POINT` m, and at the end."""
     unwrapped = np.unwrap(path[:, 3])
-    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:3], axis=0).T))])
-    start_distance = float(np.interp(0.0, path[:, 0], driven))
-    count = max(1, round((driven[-1] - start_distance) / KEY_POINT))
-    distances = np.linspace(start_distance, driven[-1], count + 1)
+    path_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:3], axis=0).T))])
+    start_distance = float(np.interp(0.0, path[:, 0], path_length))
+    count = max(1, round((path_length[-1] - start_distance) / KEY_POINT))
+    distances = np.linspace(start_distance, path_length[-1], count + 1)
     # Interpolation over distance needs increasing values, and a standing ego adds none.
-    is_increasing = np.concatenate([[True], np.diff(driven) > 1e-9])
+    is_increasing = np.concatenate([[True], np.diff(path_length) > 1e-9])
     x, y, yaw = (
-        np.interp(distances, driven[is_increasing], values[is_increasing])
+        np.interp(distances, path_length[is_increasing], values[is_increasing])
         for values in (path[:, 1], path[:, 2], unwrapped)
     )
     return tuple(
@@ -302,5 +302,5 @@ def _actor(track: _Track) -> Actor:
     if len(rows) == 1:  # annotated in one key frame: it exists for that moment only
         rows = np.concatenate([rows, rows])
         rows[1, 0] += STEP
-    kept_rows: Rows = rounded_rows(rows)
+    kept_rows: Rows = round_rows(rows)
     return Actor(track.name, track.model, Pose(*kept_rows[0][1:]), trajectory=kept_rows)

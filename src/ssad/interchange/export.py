@@ -13,14 +13,14 @@ from ssad.core.types import Episode, Scenario
 from ssad.interchange.commonroad_writer import STILL, commonroad_text
 from ssad.interchange.openscenario_writer import openscenario_text
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.world.roads import load_town, town_signals, town_xodr
 
-Written = tuple[list[Path], list[str]]
+ExportedFiles = tuple[list[Path], list[str]]
 """The files, and what they do not carry over, a line for each scenario that it is true of."""
 
 
-def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> Written:
+def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> ExportedFiles:
     """Write scenarios as OpenSCENARIO XML 1.2 with OpenDRIVE.
 
     Args:
@@ -35,7 +35,7 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         SSADError: A scenario cannot be built, its town has no OpenDRIVE, or a file cannot be written.
     """
     files: list[Path] = []
-    lost: list[str] = []
+    lines: list[str] = []
     folder = make_folder(out)
     names = file_names(scenarios)
     for town in sorted({scenario.town for scenario in scenarios}):
@@ -48,11 +48,13 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         )
         files.append(folder / f"{name}.xosc")
         write_atomic(files[-1], text)
-        lost += omissions
-    return files, lost
+        lines += omissions
+    return files, lines
 
 
-def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0, system: str = "autopilot") -> Written:
+def export_commonroad(
+    scenarios: Sequence[Scenario], out: Path, *, seed: int = 0, system: str = "autopilot"
+) -> ExportedFiles:
     """Write scenarios as CommonRoad XML 2020a, with the lanelets of their towns.
 
     The format has trajectories only: agents that react to the ego, or act at random, repeat what they did while
@@ -71,7 +73,7 @@ def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0
         SSADError: A scenario cannot be built or driven, or a file cannot be written.
     """
     files: list[Path] = []
-    lost: list[str] = []
+    lines: list[str] = []
     folder = make_folder(out)
     names = file_names(scenarios)
     numbers: Counter[str] = Counter()
@@ -79,13 +81,13 @@ def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0
         graph = load_town(scenario.town)
         replayed, was_replayed = _with_trajectories(episode(scenario, seed), graph, system)
         if was_replayed:
-            lost.append(f"what others do by themselves: they repeat what they did beside '{system}'")
+            lines.append(f"what others do by themselves: they repeat what they did beside '{system}'")
         numbers[scenario.town] += 1
         text, omissions = commonroad_text(replayed, graph, number=numbers[scenario.town])
         files.append(folder / f"{name}.xml")
         write_atomic(files[-1], text)
-        lost += omissions
-    return files, lost
+        lines += omissions
+    return files, lines
 
 
 def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple[Episode, bool]:
@@ -97,7 +99,7 @@ def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple
     from ssad.world.world import World
 
     (trace,) = rollout(World([nominal], {nominal.town: graph}), make_system(system))
-    return build_episode(frozen(nominal, trace), graph, seed=nominal.seed), True
+    return build_episode(freeze_episode(nominal, trace), graph, seed=nominal.seed), True
 
 
 def episode(scenario: Scenario, seed: int) -> Episode:

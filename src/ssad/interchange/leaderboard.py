@@ -24,10 +24,10 @@ from ssad.core.errors import ConfigError, FormatError, RouteError, SSADError
 from ssad.core.safeio import MIB, dump_json, make_folder, read_xml, write_atomic
 from ssad.core.seeding import generator
 from ssad.core.types import Episode, Pose, Scenario
-from ssad.interchange.export import Written, episode
-from ssad.interchange.leaderboard_site import LIMITS, Site
-from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, no_actors
-from ssad.interchange.openscenario_places import Values
+from ssad.interchange.export import ExportedFiles, episode
+from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
+from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
+from ssad.interchange.openscenario_places import AttributeReader
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.knowledge._placing import trigger_index
 from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
@@ -82,16 +82,16 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
     root = read_xml(path, limit=MAX_BYTES)
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
-    values, lost, scenarios = Values(str(path), root), Counter[str](), list[Scenario]()
+    values, omissions, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
     towns = town_names()
     for route in root.iterfind("route"):
         route_id, town = values.text(route, "id"), values.text(route, "town")
         points = _points(values, route)
         if route.find("weathers/weather") is not None:
-            lost["weather of a route"] += 1
+            omissions["weather of a route"] += 1
         elements = route.findall("scenarios/scenario")
         if not elements:
-            lost["a route without a scenario"] += 1
+            omissions["a route without a scenario"] += 1
         for element_index, element in enumerate(elements):
             type_name = values.text(element, "type")
             template = Scenario(
@@ -105,14 +105,14 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
             )
             stored = element.find(OWN)
             if stored is None and type_name not in TYPES:
-                lost[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
+                omissions[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
                 continue
             if town not in towns:
-                lost[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
+                omissions[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
                 continue
             try:
                 scenario = (
-                    _scenario_of_item(values, element, template, lost)
+                    _scenario_of_item(values, element, template, omissions)
                     if stored is None
                     else _restored_scenario(values, element, stored, template)
                 )
@@ -122,18 +122,18 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
             except ConfigError as error:
                 raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
             except SSADError as error:
-                lost[str(error)] += 1
+                omissions[str(error)] += 1
                 continue
             scenarios.append(scenario)
     if not scenarios:
-        reasons = "; ".join(list(lost)[:3]) or "it has no route"
+        reasons = "; ".join(list(omissions)[:3]) or "it has no route"
         raise FormatError(f"{path}: no scenario in it can be played here: {reasons}")
     return tuple(scenarios), tuple(
-        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in lost.items()
+        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in omissions.items()
     )
 
 
-def _points(values: Values, route: Node) -> tuple[Pose, ...]:
+def _points(values: AttributeReader, route: Node) -> tuple[Pose, ...]:
     """Return the key points of a route, each with the heading to the next."""
     positions = [_place(values, element) for element in route.iterfind("waypoints/position")]
     # Repeated points have no heading to the next.
@@ -143,28 +143,28 @@ def _points(values: Values, route: Node) -> tuple[Pose, ...]:
         if index == 0 or math.dist(position, positions[index - 1]) > 0.1
     ]
     if len(positions) < 2:
-        raise values.fail(route, f"route {route.get('id', '?')[:40]} needs two positions, has {len(positions)}")
+        raise values.error(route, f"route {route.get('id', '?')[:40]} needs two positions, has {len(positions)}")
     headings = [math.atan2(end[1] - start[1], end[0] - start[0]) for start, end in pairwise(positions)]
     return tuple(
         Pose(*position, heading) for position, heading in zip(positions, [*headings, headings[-1]], strict=True)
     )
 
 
-def _place(values: Values, item: Node) -> tuple[float, float]:
+def _place(values: AttributeReader, item: Node) -> tuple[float, float]:
     return values.number(item, "x"), 0.0 - values.number(item, "y")
 
 
-def _scenario_of_item(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> Scenario:
+def _scenario_of_item(values: AttributeReader, item: Node, base: Scenario, omissions: Counter[str]) -> Scenario:
     """The scenario of an item of a route, with the actors of its type. RouteError: its town does not allow it."""
     type_name = base.group
     add_actors = TYPES[type_name]
     trigger = item.find("trigger_point")
-    is_empty = getattr(add_actors, "func", add_actors) is no_actors
+    is_empty = getattr(add_actors, "func", add_actors) is add_no_actors
     if trigger is not None:
         yaw = -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))
         base = replace(base, trigger=None if is_empty else Pose(*_place(values, trigger), yaw))
     elif not is_empty:
-        raise values.fail(item, f"'{type_name}' has no trigger_point")
+        raise values.error(item, f"'{type_name}' has no trigger_point")
     scenario_from(scenario_data(base))  # checks names and places before they are used
     graph = load_town(base.town)
     route = route_along(graph, base.route)
@@ -178,22 +178,22 @@ def _scenario_of_item(values: Values, item: Node, base: Scenario, lost: Counter[
             f"them {route.length:.0f} m"
         )
     start = 0 if is_empty else trigger_index(base, route)
-    site = Site(base, graph, route, start, item, values, generator("leaderboard", base.name))
+    site = ScenarioBuilder(base, graph, route, start, item, values, generator("leaderboard", base.name))
     add_actors(site)
     for child in item:
-        if child.tag not in site.used and child.tag != "trigger_point":
-            lost[f"{child.tag[:40]} of {type_name}"] += 1
+        if child.tag not in site.used_names and child.tag != "trigger_point":
+            omissions[f"{child.tag[:40]} of {type_name}"] += 1
     return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
 
 
-def _restored_scenario(values: Values, item: Node, source: Node, base: Scenario) -> Scenario:
+def _restored_scenario(values: AttributeReader, item: Node, source: Node, base: Scenario) -> Scenario:
     """The scenario that SSAD wrote; its route and trigger are those of the file where somebody has moved them."""
     try:
         content = json.loads(values.text(source, "scenario"))
     except (ValueError, RecursionError) as error:
-        raise values.fail(source, f"scenario is not JSON: {str(error)[:100]}") from None
+        raise values.error(source, f"scenario is not JSON: {str(error)[:100]}") from None
     if not isinstance(content, dict):
-        raise values.fail(source, "scenario is not a mapping of keys")
+        raise values.error(source, "scenario is not a mapping of keys")
     scenario = scenario_from(content | {"town": base.town})
     is_unmoved = len(scenario.route) == len(base.route) and all(
         math.dist((stored_point.x, stored_point.y), (file_point.x, file_point.y)) < MOVED
@@ -212,7 +212,7 @@ def _restored_scenario(values: Values, item: Node, source: Node, base: Scenario)
 # ---------------------------------------------------------------- out
 
 
-def export_leaderboard(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> Written:
+def export_leaderboard(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> ExportedFiles:
     """Write routes.xml of leaderboard 2.0: for each scenario a route with its type and trigger.
 
     Args:
@@ -249,14 +249,14 @@ def export_leaderboard(scenarios: Sequence[Scenario], out: Path, *, seed: int = 
     return [_write(root, make_folder(out) / "routes.xml")], omissions
 
 
-def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> Written:
+def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> ExportedFiles:
     """Write routes.xml and scenarios.json of leaderboard 1.0; see `export_leaderboard`."""
     root, omissions = Element("routes"), list[str]()
     towns: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for index, scenario in enumerate(_exportable(scenarios, TYPES_1, seed, omissions)):
+    for index, scenario in enumerate(_exportable_scenarios(scenarios, TYPES_1, seed, omissions)):
         route = SubElement(root, "route", id=str(index), town=scenario.town)
         built_episode = episode(scenario, seed)
-        for pose in _dense(built_episode):
+        for pose in _dense_route(built_episode):
             SubElement(route, "waypoint", _xyz(pose) | {"pitch": "0.0", "roll": "0.0", "yaw": _yaw(pose)})
         trigger = _trigger(scenario)
         event: dict[str, Any] = {"transform": _xyz(trigger) | {"pitch": "0.0", "yaw": _yaw(trigger)}}
@@ -277,24 +277,26 @@ def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int =
     return [_write(root, folder / "routes.xml"), folder / "scenarios.json"], omissions
 
 
-def _exportable(scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int, lost: list[str]) -> list[Scenario]:
+def _exportable_scenarios(
+    scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int, omissions: list[str]
+) -> list[Scenario]:
     """Those that have a type; what is lost of them."""
     supported = []
     for scenario in scenarios:
         if scenario.type not in types:
-            lost.append(f"scenarios of type {scenario.type}: the leaderboard has none such")
+            omissions.append(f"scenarios of type {scenario.type}: the leaderboard has none such")
             continue
         episode(scenario, seed)
-        lost.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
+        omissions.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
         if scenario.parameters:
-            lost.append(f"parameters {', '.join(sorted(scenario.parameters))}")
+            omissions.append(f"parameters {', '.join(sorted(scenario.parameters))}")
         supported.append(scenario)
     if not supported:
         raise SSADError(f"none of these scenarios has a counterpart in the leaderboard; it plays: {', '.join(types)}")
     return supported
 
 
-def _dense(built: Episode) -> list[Pose]:
+def _dense_route(built: Episode) -> list[Pose]:
     """A point of the ego's route each 5 m, and its end: a trigger must lie on the lines between them."""
     route = built.agents[0].route
     assert route is not None

@@ -16,14 +16,14 @@ from ssad.core.types import F64, Actor, EpisodeLimits, LaneType, Phase, PhaseTri
 from ssad.scenarios.dynamic.knowledge._meeting import time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
     LanePosition,
-    ahead,
-    behind,
-    beside,
+    adjacent_place,
     junction_span,
     lane_path,
+    move_pose,
+    place_ahead,
+    place_behind,
     pose_at,
     route_place,
-    shifted,
     turn_of,
     width_at,
 )
@@ -34,7 +34,7 @@ from ssad.world.roads.query import nearest_all
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from ssad.interchange.openscenario_places import Values
+    from ssad.interchange.openscenario_places import AttributeReader
 
 SPEED: Final = 8.0  # m/s, assumed speed of the ego where the leaderboard measures seconds to a place
 PICK_UP: Final = 2.5  # m/s^2, assumed acceleration of the ego at the start
@@ -49,7 +49,7 @@ _LONG = 20.0  # m of driving, after which a trajectory gets another row
 
 
 @dataclass
-class Site:
+class ScenarioBuilder:
     """A scenario of a route file in its town, while its actors are being added.
 
     Attributes:
@@ -60,7 +60,7 @@ class Site:
         item: The element of the file.
         values: Reads the attributes of elements.
         random: Draws what the leaderboard draws.
-        used: Tags of the parameters that were read.
+        used_names: Tags of the parameters that were read.
         actors: Actors added so far.
         signals: States of the traffic lights.
         target_speed: Target speed of the ego, m/s.
@@ -71,9 +71,9 @@ class Site:
     route: Route
     start: int
     item: Element
-    values: Values
+    values: AttributeReader
     random: np.random.Generator
-    used: set[str] = field(default_factory=set)
+    used_names: set[str] = field(default_factory=set)
     actors: list[Actor] = field(default_factory=list)
     signals: SignalPlan = field(default_factory=SignalPlan)
     target_speed: float = SPEED
@@ -97,21 +97,21 @@ class Site:
 
     def _bounded(self, tag: str, key: str, default: float, low: float, high: float) -> float:
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         if element is None:
             return default
         value = self.values.number(element, key)
         if not low <= value <= high:
-            raise self.values.fail(element, f"{key} is {value:g}, outside {low:g} to {high:g}")
+            raise self.values.error(element, f"{key} is {value:g}, outside {low:g} to {high:g}")
         return value
 
     def word(self, tag: str, default: str, allowed: Sequence[str] = ()) -> str:
         """Return the text `value` of a child. FormatError if it is not allowed."""
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         value = default if element is None else self.values.text(element, "value")
         if allowed and value not in allowed:
-            raise self.values.fail(tag, f"'{value[:40]}' is not one of {', '.join(allowed)}")
+            raise self.values.error(tag, f"'{value[:40]}' is not one of {', '.join(allowed)}")
         return value
 
     def side(self) -> float:
@@ -121,18 +121,18 @@ class Site:
     def lane_at(self, tag: str) -> LanePosition:
         """The lane under a place of the file. FormatError where it is missing, RouteError off the road."""
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         if element is None:
-            raise self.values.fail(self.item, f"'{self.item.get('type')}' has no {tag}")
+            raise self.values.error(self.item, f"'{self.item.get('type')}' has no {tag}")
         # The file has CARLA's left-handed frame. 0.0 - y instead of -y avoids a negative zero.
         position = self.values.number(element, "x"), 0.0 - self.values.number(element, "y")
         lane, s, gap = nearest_all(self.graph, position, (LaneType.DRIVING, LaneType.BIKING))
         nearest = int(np.argmin(gap))
         if gap[nearest] > _NEAR:
-            raise self.fail(f"{tag} is {gap[nearest]:.0f} m off the road")
+            raise self.error(f"{tag} is {gap[nearest]:.0f} m off the road")
         return LanePosition(int(lane[nearest]), float(s[nearest]))
 
-    def fail(self, message: str) -> RouteError:
+    def error(self, message: str) -> RouteError:
         """Return a RouteError that names the scenario."""
         return RouteError(f"scenario {self.scenario.name}: {message}")
 
@@ -147,13 +147,13 @@ class Site:
             if len(inside) and inside[0] > 0:
                 index = self.start + int(inside[0]) - 1
         if index >= len(self.route.xy):
-            raise self.fail(f"the route ends {index - len(self.route.xy) + 1:.0f} m before its place")
+            raise self.error(f"the route ends {index - len(self.route.xy) + 1:.0f} m before its place")
         return index
 
     def pose(self, index: int, right: float = 0.0, turn: float = 0.0) -> Pose:
         """Return the pose of a route point, moved to the right, m, and turned to the left, rad."""
         x, y = self.route.xy[index].tolist()
-        return shifted(Pose(x, y, float(self.route.yaw[index])), 0.0, -right, turn)
+        return move_pose(Pose(x, y, float(self.route.yaw[index])), 0.0, -right, turn)
 
     def place(self, index: int) -> LanePosition:
         """Return the lane under a route point."""
@@ -163,29 +163,29 @@ class Site:
         """Return the width of the lane at a route point, m."""
         return width_at(self.graph, self.place(index))
 
-    def edge(self, index: int, side: float, kinds: Sequence[LaneType] = _ROAD) -> float:
+    def edge_distance(self, index: int, side: float, kinds: Sequence[LaneType] = _ROAD) -> float:
         """Return the distance to the outer edge of the last lane of these kinds, m, oncoming lanes included."""
         ego_lane, pose = self.place(index), self.pose(index)
         outermost, neighbour_side = ego_lane, "right" if side > 0.0 else "left"
-        while (neighbour := beside(self.graph, outermost, neighbour_side)) is not None and self.graph.kind[
+        while (neighbour := adjacent_place(self.graph, outermost, neighbour_side)) is not None and self.graph.kind[
             neighbour.lane
         ] in kinds:
             # Seen from an oncoming lane, the next lane further out is to its right.
-            if not self.graph.same_direction(outermost.lane, neighbour.lane):
+            if not self.graph.is_same_direction(outermost.lane, neighbour.lane):
                 neighbour_side = "right"
             outermost = neighbour
         outermost_pose = pose_at(self.graph, outermost)
         return math.dist((pose.x, pose.y), (outermost_pose.x, outermost_pose.y)) + 0.5 * width_at(self.graph, outermost)
 
-    def oncoming(self, index: int) -> LanePosition:
+    def oncoming_lane(self, index: int) -> LanePosition:
         """Return the lane to the left with oncoming traffic. RouteError if there is none."""
-        neighbour = beside(self.graph, self.place(index), "left")
+        neighbour = adjacent_place(self.graph, self.place(index), "left")
         if (
             neighbour is None
             or self.graph.kind[neighbour.lane] != LaneType.DRIVING
-            or self.graph.same_direction(self.place(index).lane, neighbour.lane)
+            or self.graph.is_same_direction(self.place(index).lane, neighbour.lane)
         ):
-            raise self.fail(f"{self.item.get('type')} needs an oncoming lane to the left of the ego's")
+            raise self.error(f"{self.item.get('type')} needs an oncoming lane to the left of the ego's")
         return neighbour
 
     def junction(self) -> tuple[int, int]:
@@ -232,14 +232,14 @@ class Site:
                 if best is None or (rank, gap) < best[:2]:
                     best = rank, gap, LanePosition(entry_lane, float(self.graph.length[entry_lane])), junction_lane
         if best is None:
-            raise self.fail(f"no lane comes into junction {junction} from where {self.item.get('type')} wants it")
+            raise self.error(f"no lane comes into junction {junction} from where {self.item.get('type')} wants it")
         return best[2], best[3]
 
     def before_junction(self, place: LanePosition, distance: float) -> LanePosition:
         """Return the place `distance` m back along lanes, or the last one before a junction."""
         farthest = place
         for step_back in np.arange(2.0, distance + 0.1, 2.0).tolist():
-            candidate = behind(self.graph, place, step_back)
+            candidate = place_behind(self.graph, place, step_back)
             if self.graph.junction[candidate.lane] >= 0:
                 break
             farthest = candidate
@@ -247,7 +247,7 @@ class Site:
 
     # ------------------------------------------------------------ when
 
-    def reaches(self, index: int, actor: Pose) -> PhaseTrigger:
+    def ego_reaches(self, index: int, actor: Pose) -> PhaseTrigger:
         """Return the condition that the ego reaches a route point.
 
         It is expressed as a distance from the next actor to be added, which waits at `actor`.
@@ -255,11 +255,11 @@ class Site:
         position = self.route.xy[min(max(index, 0), len(self.route.xy) - 1)].tolist()
         return PhaseTrigger("ego_distance", math.dist(position, (actor.x, actor.y)), len(self.actors))
 
-    def seconds_before(self, index: int, seconds: float, min_distance: float, actor: Pose) -> PhaseTrigger:
-        """Return the condition that the ego is so many seconds or metres before a route point; see `reaches`."""
-        return self.reaches(index - round(max(seconds * SPEED, min_distance) / self.route.spacing), actor)
+    def ego_is_seconds_before(self, index: int, seconds: float, min_distance: float, actor: Pose) -> PhaseTrigger:
+        """Return the condition that the ego is so many seconds or metres before a route point; see `ego_reaches`."""
+        return self.ego_reaches(index - round(max(seconds * SPEED, min_distance) / self.route.spacing), actor)
 
-    def arrival(self, index: int) -> float:
+    def arrival_time(self, index: int) -> float:
         """Seconds after which an ego that starts from rest and then keeps `SPEED` comes to a route point."""
         return time_to_cover(index * self.route.spacing, SPEED, PICK_UP)
 
@@ -270,11 +270,11 @@ class Site:
         rounded_path = () if path is None else tuple((round(x, 3), round(y, 3)) for x, y in path.tolist())
         self.actors.append(Actor(name, model, pose, tuple(phases), rounded_path))
 
-    def car(self) -> str:
+    def draw_car_model(self) -> str:
         """Draw a model of a car."""
         return str(self.random.choice(CARS))
 
-    def driver(self, name: str, start: LanePosition, distance: float, speed: float) -> None:
+    def add_driver(self, name: str, start: LanePosition, distance: float, speed: float) -> None:
         """Add a car that the Autopilot drives straight on for a distance; it reacts to the ego."""
         lane_points = lane_path(self.graph, start, distance)
         distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane_points, axis=0).T))])
@@ -287,9 +287,11 @@ class Site:
             for key_distance in key_distances
         )
         pose = pose_at(self.graph, start)
-        self.actors.append(Actor(name, self.car(), pose, path=key_points, policy="autopilot", target_speed=speed))
+        self.actors.append(
+            Actor(name, self.draw_car_model(), pose, path=key_points, policy="autopilot", target_speed=speed)
+        )
 
-    def oncoming_cars(self, index: int, gap: tuple[float, float], *, after: float = 5.0) -> None:
+    def add_oncoming_cars(self, index: int, gap: tuple[float, float], *, after: float = 5.0) -> None:
         """Add oncoming cars.
 
         The first passes a route point `after` seconds after an ego that then waits there.
@@ -299,28 +301,28 @@ class Site:
             gap: Range of the distance between two cars, m.
             after: Time after the ego's arrival, s.
         """
-        lane = self.oncoming(index)
+        lane = self.oncoming_lane(index)
         speed = min(float(self.route.speed_limit[index]), 1.5 * SPEED)
-        distance_back = speed * (self.arrival(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
+        distance_back = speed * (self.arrival_time(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
         previous_start: LanePosition | None = None
         for _ in range(6):
-            start = behind(self.graph, lane, distance_back)
-            if previous_start is not None and self.apart(start, previous_start) < 8.0:
+            start = place_behind(self.graph, lane, distance_back)
+            if previous_start is not None and self.distance_between(start, previous_start) < 8.0:
                 return  # the road begins here, so no car can start further back
             if self.graph.junction[start.lane] < 0:
-                self.driver(f"oncoming car {len(self.actors)}", start, distance_back + 80.0, speed)
+                self.add_driver(f"oncoming car {len(self.actors)}", start, distance_back + 80.0, speed)
                 previous_start = start
             distance_back += float(self.random.uniform(*gap))
 
-    def flow(self, path: F64, gap: tuple[float, float], speed: float, *, models: Sequence[str] = CARS) -> None:
+    def add_flow(self, path: F64, gap: tuple[float, float], speed: float, *, models: Sequence[str] = CARS) -> None:
         """Vehicles that come one after another along a way [N, 2] at a steady speed, whatever is in their way.
 
         They appear where it begins and leave where it ends; at the start they are all along it.
         """
         path_length = float(np.hypot(*np.diff(path, axis=0).T).sum())
         if path_length > LONGEST:
-            raise self.fail(f"the way of its flow has {path_length:.0f} m, more than {LONGEST:.0f} m")
-        template = _timed(path, speed)
+            raise self.error(f"the way of its flow has {path_length:.0f} m, more than {LONGEST:.0f} m")
+        template = _timed_rows(path, speed)
         start_time = -float(template[-1, 0])
         while (start_time := start_time + float(self.random.uniform(*gap)) / speed) < FLOW:
             rows = template.copy()
@@ -331,22 +333,22 @@ class Site:
             pose = Pose(*rows[0, 1:].tolist())
             self.actors.append(Actor(actor_name, model, pose, trajectory=tuple(map(tuple, rows.tolist()))))
 
-    def way(self, start: LanePosition, end: LanePosition) -> F64:
+    def path_between(self, start: LanePosition, end: LanePosition) -> F64:
         """Return the path [N, 2] along lanes from one place to another. RouteError if there is none."""
         start_pose, end_pose = pose_at(self.graph, start), pose_at(self.graph, end)
         try:
             return route_along(self.graph, [start_pose, end_pose]).xy.astype(np.float64)
         except RouteError as error:
-            raise self.fail(str(error)) from None
+            raise self.error(str(error)) from None
 
-    def offset(self, path: F64, right: float | F64) -> F64:
+    def offset_path(self, path: F64, right: float | F64) -> F64:
         """A way moved to the right, m: by one number or one for each point."""
         heading = np.gradient(path, axis=0)
         normal = np.stack([heading[:, 1], -heading[:, 0]], 1) / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
         moved: F64 = path + np.atleast_1d(right)[:, None] * normal
         return moved
 
-    def along(self, index: int, distance: float, right: float, *, into: float = 0.0) -> F64:
+    def parallel_path(self, index: int, distance: float, right: float, *, into: float = 0.0) -> F64:
         """Return a path beside the ego's route.
 
         Args:
@@ -360,25 +362,25 @@ class Site:
         """
         path = self.route.xy[index : index + max(3, round(distance / self.route.spacing))].astype(np.float64)
         if len(path) < 3:
-            raise self.fail("the route ends too soon")
+            raise self.error("the route ends too soon")
         offset_share = np.ones(len(path))
         if into > 0.0:
             progress = np.clip(self.route.spacing * np.arange(len(path)) / into, 0.0, 1.0)
             # A half cosine has no kink at either end, so a vehicle can follow it.
             offset_share = 0.5 * (1.0 + np.cos(np.pi * progress))
-        return self.offset(path, right * offset_share)
+        return self.offset_path(path, right * offset_share)
 
-    def beyond(self, start: LanePosition, distance: float) -> LanePosition:
+    def place_ahead(self, start: LanePosition, distance: float) -> LanePosition:
         """Return the place `distance` m ahead along lanes, straight on."""
-        return ahead(self.graph, start, distance)
+        return place_ahead(self.graph, start, distance)
 
-    def apart(self, first: LanePosition, second: LanePosition) -> float:
+    def distance_between(self, first: LanePosition, second: LanePosition) -> float:
         """Return the distance between two places, m."""
         first_pose, second_pose = pose_at(self.graph, first), pose_at(self.graph, second)
         return math.dist((first_pose.x, first_pose.y), (second_pose.x, second_pose.y))
 
 
-def _timed(path: F64, speed: float) -> F64:
+def _timed_rows(path: F64, speed: float) -> F64:
     """Rows [M, 4] of time, x, y and yaw of a drive along a way at a speed; few where it is straight."""
     steps = np.diff(path, axis=0)
     path, steps = path[np.concatenate([[True], np.hypot(*steps.T) > 1e-6])], steps[np.hypot(*steps.T) > 1e-6]

@@ -14,7 +14,7 @@ from ssad.core.errors import FormatError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType, Pose
-from ssad.scenarios.dynamic.knowledge._placing import LanePosition, ahead, behind, pose_at, shifted
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, move_pose, place_ahead, place_behind, pose_at
 from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ NEAR = 2.0  # m outside a lane within which an entity still belongs to it
 _PARAMETER = re.compile(r"^\$\{?\s*(\w+)\s*\}?$")
 
 
-class Values:
+class AttributeReader:
     """Attributes of elements with the document's parameters substituted; errors name file and element."""
 
     def __init__(self, location: str, root: Element) -> None:
@@ -35,7 +35,7 @@ class Values:
             item.get("name", ""): item.get("value", "") for item in root.iter("ParameterDeclaration")
         }
 
-    def fail(self, element: Element | str, message: str) -> FormatError:
+    def error(self, element: Element | str, message: str) -> FormatError:
         """Return a FormatError that names the file and the element."""
         tag = element if isinstance(element, str) else element.tag
         return FormatError(f"{self.location}: {tag}: {message}")
@@ -44,14 +44,14 @@ class Values:
         """An attribute as text. FormatError if it is missing and there is no default, or its parameter is unknown."""
         value = element.get(name, default)
         if value is None:
-            raise self.fail(element, f"attribute '{name}' is missing")
+            raise self.error(element, f"attribute '{name}' is missing")
         reference = _PARAMETER.match(value)
         if reference is None:
             if value.startswith("$"):
-                raise self.fail(element, f"{name}: expressions are not read, only $parameter: {value[:60]}")
+                raise self.error(element, f"{name}: expressions are not read, only $parameter: {value[:60]}")
             return value
         if reference[1] not in self.parameters:
-            raise self.fail(element, f"{name}: parameter ${reference[1]} is not declared")
+            raise self.error(element, f"{name}: parameter ${reference[1]} is not declared")
         return self.parameters[reference[1]]
 
     def number(self, element: Element, name: str, default: float | None = None) -> float:
@@ -60,24 +60,30 @@ class Values:
         try:
             value = float(number_text)
         except ValueError:
-            raise self.fail(element, f"{name} is '{number_text[:40]}', not a number") from None
+            raise self.error(element, f"{name} is '{number_text[:40]}', not a number") from None
         if not math.isfinite(value):
-            raise self.fail(element, f"{name} is '{number_text[:40]}', not a finite number")
+            raise self.error(element, f"{name} is '{number_text[:40]}', not a finite number")
         return value
 
     def lanes(self, element: Element, name: str) -> int:
         """A number of lanes to the left, negative to the right. FormatError where no road has as many."""
         value = self.number(element, name, 0.0)
         if abs(value) > LANES:
-            raise self.fail(element, f"{name} is {value:g}: no road has so many lanes")
+            raise self.error(element, f"{name} is {value:g}: no road has so many lanes")
         return int(value)
 
 
 class PositionReader:
-    """Positions as poses in the world frame; inexact conversions are counted in `lost`."""
+    """Positions as poses in the world frame; inexact conversions are counted in `omissions`."""
 
     def __init__(
-        self, values: Values, graph: LaneGraph, *, mirrored: bool, lost: Counter[str], starts: Mapping[str, Element]
+        self,
+        values: AttributeReader,
+        graph: LaneGraph,
+        *,
+        mirrored: bool,
+        omissions: Counter[str],
+        starts: Mapping[str, Element],
     ) -> None:
         """Create the reader of one document.
 
@@ -85,10 +91,10 @@ class PositionReader:
             values: Reads the attributes of elements.
             graph: Lane graph of the town.
             mirrored: World positions are in CARLA's left-handed frame.
-            lost: Counter of the features that are not carried over.
+            omissions: Counter of the features that are not carried over.
             starts: Name of an entity -> its position at the start.
         """
-        self.values, self.graph, self.lost, self.starts = values, graph, lost, starts
+        self.values, self.graph, self.omissions, self.starts = values, graph, omissions, starts
         self._hand = -1.0 if mirrored else 1.0
         self._open: set[str] = set()
         self._kinds: dict[str, Callable[[Element], Pose]] = {
@@ -104,22 +110,22 @@ class PositionReader:
     def pose(self, position: Element | None, *, within: Element) -> Pose:
         """Return the pose of a Position. FormatError if it is missing, broken or of an unsupported kind."""
         if position is None or not len(position):
-            raise self.values.fail(within, "Position is missing or empty")
+            raise self.values.error(within, "Position is missing or empty")
         kind = position[0].tag
         if kind not in self._kinds:
-            raise self.values.fail(within, f"a {kind} is not read; known: {', '.join(self._kinds)}")
+            raise self.values.error(within, f"a {kind} is not read; known: {', '.join(self._kinds)}")
         return self._kinds[kind](position[0])
 
-    def reads(self, position: Element | None) -> bool:
+    def is_supported(self, position: Element | None) -> bool:
         """Return whether a position is of a supported kind; true if it is missing, which `pose` reports."""
         return position is None or not len(position) or position[0].tag in self._kinds
 
     def start(self, entity: str, *, within: Element) -> Pose:
         """Return the start pose of an entity. FormatError if it has none, or positions refer to each other."""
         if entity not in self.starts:
-            raise self.values.fail(within, f"entity '{entity}' has no position at the start")
+            raise self.values.error(within, f"entity '{entity}' has no position at the start")
         if entity in self._open:
-            raise self.values.fail(within, f"the position of '{entity}' depends on itself")
+            raise self.values.error(within, f"the position of '{entity}' depends on itself")
         self._open.add(entity)
         try:
             return self.pose(self.starts[entity], within=within)
@@ -147,7 +153,7 @@ class PositionReader:
         # Adding 0.0 turns a negative zero into zero.
         return Pose(x, self._hand * y + 0.0, self._hand * yaw + 0.0)
 
-    def _turned(self, element: Element, pose: Pose) -> Pose:
+    def _apply_orientation(self, element: Element, pose: Pose) -> Pose:
         """Return the pose with an Orientation of the element, relative unless it says absolute."""
         orientation = element.find("Orientation")
         if orientation is None:
@@ -162,12 +168,12 @@ class PositionReader:
         road = int(self.values.number(element, "roadId"))
         sections = np.flatnonzero((graph.road == road) & (graph.lane_id == lane))
         if not len(sections):
-            raise self.values.fail(element, f"town '{graph.name}' has no lane {lane} of road {road}")
+            raise self.values.error(element, f"town '{graph.name}' has no lane {lane} of road {road}")
         sections = sections[np.argsort(graph.section[sections])]
         road_length = float(graph.length[sections].sum())
         if not -1.0 <= s <= road_length + 1.0:
-            raise self.values.fail(element, f"s is {s:g} m; lane {lane} of road {road} has {road_length:.1f} m")
-        self.lost["positions by road and s are taken along the lane, not along the road's reference line"] += 1
+            raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {road} has {road_length:.1f} m")
+        self.omissions["positions by road and s are taken along the lane, not along the road's reference line"] += 1
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:
@@ -182,52 +188,56 @@ class PositionReader:
         lane_id = int(self.values.number(element, "laneId"))
         place = self._on_lane(element, lane_id, self.values.number(element, "s"))
         lateral_offset = self.values.number(element, "offset", 0.0) * (1.0 if lane_id < 0 else -1.0)
-        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, lateral_offset))
+        return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _road(self, element: Element) -> Pose:
         t = self.values.number(element, "t")
         road_id = int(self.values.number(element, "roadId"))
         driving_lanes = np.flatnonzero((self.graph.road == road_id) & (self.graph.kind == LaneType.DRIVING))
         if not len(driving_lanes):
-            raise self.values.fail(element, f"town '{self.graph.name}' has no driving lane of road {road_id}")
+            raise self.values.error(element, f"town '{self.graph.name}' has no driving lane of road {road_id}")
         lane_ids = sorted({int(lane_id) for lane_id in self.graph.lane_id[driving_lanes]}, key=abs)
         nearest_id = next((lane_id for lane_id in lane_ids if lane_id * t > 0.0), lane_ids[0])
         place = self._on_lane(element, nearest_id, self.values.number(element, "s"))
         width = self.graph.at(place.lane, place.s)[3]
         middle = math.copysign((abs(nearest_id) - 0.5) * width, nearest_id)
         lateral_offset = (t - middle) * (1.0 if nearest_id < 0 else -1.0)
-        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, lateral_offset))
+        return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _relative(self, element: Element) -> Pose:
         reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
         forward = self.values.number(element, "dx", 0.0)
         leftward = self._hand * self.values.number(element, "dy", 0.0)
         if element.tag == "RelativeWorldPosition":
-            return self._turned(
+            return self._apply_orientation(
                 element, Pose(reference_pose.x + forward, reference_pose.y + leftward, reference_pose.yaw)
             )
-        return self._turned(element, shifted(reference_pose, forward, leftward))
+        return self._apply_orientation(element, move_pose(reference_pose, forward, leftward))
 
     def _along(self, element: Element) -> Pose:
         reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
         place = self.lane_under(reference_pose)
         if place is None:
-            raise self.values.fail(element, "no lane under the entity that it refers to")
+            raise self.values.error(element, "no lane under the entity that it refers to")
         lateral_offset = self.values.number(element, "dt" if element.tag == "RelativeRoadPosition" else "offset", 0.0)
         distance = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
         lane_count = self.values.lanes(element, "dLane")
         if abs(distance) > LONGEST:
-            raise self.values.fail(element, f"ds is {distance:g} m, beyond {LONGEST:g} m")
-        place = ahead(self.graph, place, distance) if distance >= 0.0 else behind(self.graph, place, -distance)
+            raise self.values.error(element, f"ds is {distance:g} m, beyond {LONGEST:g} m")
+        place = (
+            place_ahead(self.graph, place, distance) if distance >= 0.0 else place_behind(self.graph, place, -distance)
+        )
         pose = pose_at(self.graph, place)
         to_left = lane_count > 0
         for _ in range(abs(lane_count)):
             lane = int((self.graph.left if to_left else self.graph.right)[place.lane])
             if lane < 0:
-                raise self.values.fail(element, f"there is no lane {lane_count} beside the entity that it refers to")
+                raise self.values.error(element, f"there is no lane {lane_count} beside the entity that it refers to")
             nearest = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
             match = int(np.flatnonzero(nearest[0] == lane)[0])
-            to_left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
+            to_left ^= not self.graph.is_same_direction(
+                place.lane, lane
+            )  # what is further left is on the right of those
             place = LanePosition(lane, float(nearest[1][match]))
             pose = pose_at(self.graph, place)
-        return self._turned(element, shifted(pose, 0.0, lateral_offset))
+        return self._apply_orientation(element, move_pose(pose, 0.0, lateral_offset))

@@ -2,7 +2,7 @@
 
 An event that changes a speed becomes a phase, its trigger the phase's condition; a trajectory with times becomes an
 actor's own; one without times, a route, or a lane change becomes its path. The ego is left to the system under test.
-Features without a counterpart are listed in `Imported.lost`.
+Features without a counterpart are listed in `ImportedScenario.omissions`.
 
 CARLA's ScenarioRunner writes world positions in CARLA's left-handed frame, which a description that begins with
 "CARLA:" indicates, and gives positions of bodies' centres (srunner/tools/openscenario_parser.py of ScenarioRunner).
@@ -24,11 +24,11 @@ from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_entities import Entity, read_entities
-from ssad.interchange.openscenario_places import PositionReader, Values
-from ssad.interchange.openscenario_triggers import Triggers
+from ssad.interchange.openscenario_places import AttributeReader, PositionReader
+from ssad.interchange.openscenario_triggers import TriggerReader
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.knowledge._placing import lane_path, shifted
+from ssad.scenarios.dynamic.knowledge._placing import lane_path, move_pose
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
 from ssad.world.roads import is_town, load_town, route_along, town_signals
@@ -43,19 +43,19 @@ _CHANGE = 25.0  # m, length of a lane change if the file gives no distance
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedScenario:
     """A scenario from another format.
 
     Attributes:
         scenario: The scenario.
-        lost: Features of the file that are not carried over, one line each.
+        omissions: Features of the file that are not carried over, one line each.
     """
 
     scenario: Scenario
-    lost: tuple[str, ...]
+    omissions: tuple[str, ...]
 
 
-def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
+def read_openscenario(path: Path, *, map_name: str | None = None) -> ImportedScenario:
     """Read the scenario of a file.
 
     Args:
@@ -75,7 +75,7 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
         logic = root.find("RoadNetwork/LogicFile")
         if logic is None or not logic.get("filepath"):
             raise FormatError(f"{path}: RoadNetwork: names no LogicFile; say which town it is with --map")
-        map_path = Values(str(path), root).text(logic, "filepath")
+        map_path = AttributeReader(str(path), root).text(logic, "filepath")
         town = Path(map_path.replace("\\", "/")).stem
         if not is_town(town):
             raise FormatError(
@@ -88,19 +88,19 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
 class _Reader:
     def __init__(self, location: str, root: Element, graph: LaneGraph, town: str) -> None:
         self.root, self.graph, self.town = root, graph, town
-        self.values = Values(location, root)
-        self.lost: Counter[str] = Counter()
+        self.values = AttributeReader(location, root)
+        self.omissions: Counter[str] = Counter()
         header = root.find("FileHeader")
         if header is None:
-            raise self.values.fail("OpenSCENARIO", "FileHeader is missing")
+            raise self.values.error("OpenSCENARIO", "FileHeader is missing")
         if self.values.text(header, "revMajor") != "1":
-            raise self.values.fail(header, f"revision {header.get('revMajor')} is not read, only 1")
-        self.about = self.values.text(header, "description", "")
-        self.own = {
+            raise self.values.error(header, f"revision {header.get('revMajor')} is not read, only 1")
+        self.description = self.values.text(header, "description", "")
+        self.own_properties = {
             property_element.get("name", "")[5:]: property_element.get("value", "")
             for property_element in header.iter("Property")
         }
-        is_carla = self.about.startswith("CARLA:")
+        is_carla = self.description.startswith("CARLA:")
         starts: dict[str, Element] = {}
         for private in root.iterfind("Storyboard/Init/Actions/Private"):
             position = private.find("PrivateAction/TeleportAction/Position")
@@ -110,18 +110,18 @@ class _Reader:
             position = action.find("AddEntityAction/Position")
             if position is not None:
                 starts.setdefault(action.get("entityRef", ""), position)
-        self.places = PositionReader(self.values, graph, mirrored=is_carla, lost=self.lost, starts=starts)
-        self.entities = read_entities(root, self.values, self.lost, centred=is_carla)
+        self.places = PositionReader(self.values, graph, mirrored=is_carla, omissions=self.omissions, starts=starts)
+        self.entities = read_entities(root, self.values, self.omissions, centred=is_carla)
         for entity in self.entities.values():
             entity.placed = entity.name in starts
             if not entity.placed and not entity.ego:
-                self.lost[f"'{entity.name}': it has no position at the start"] += 1
-        self.triggers = Triggers(self.places, self.entities, self.lost)
+                self.omissions[f"'{entity.name}': it has no position at the start"] += 1
+        self.triggers = TriggerReader(self.places, self.entities, self.omissions)
         self.ego = self.triggers.ego
 
     # ------------------------------------------------------------ the document
 
-    def read(self, stem: str) -> Imported:
+    def read(self, stem: str) -> ImportedScenario:
         """Return the scenario, checked, and the features that are not carried over."""
         forced_signals = self._start()
         for maneuvers in self.root.iterfind("Storyboard/Story/Act/ManeuverGroup"):
@@ -130,12 +130,12 @@ class _Reader:
         for act in self.root.iterfind("Storyboard/Story/Act"):
             self._act_trigger(act)
         limits = self._limits()
-        if self.own.get("contact") in ("end", "count", "remove"):
-            limits = replace(limits, contact=self.own["contact"])  # type: ignore[arg-type]
+        if self.own_properties.get("contact") in ("end", "count", "remove"):
+            limits = replace(limits, contact=self.own_properties["contact"])  # type: ignore[arg-type]
         key_points = self._ego_route()
         ego_route = route_along(self.graph, key_points)
         start_pose = self._centre(self.ego, self.places.start(self.ego.name, within=self.root))
-        name = scenario_name(self.about.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
+        name = scenario_name(self.description.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
         speed = self.ego.target_speed or self.ego.speed or Scenario.target_speed
         scenario = Scenario(
             name=name,
@@ -145,31 +145,31 @@ class _Reader:
             parameters=start_parameters(ego_route, start_pose, self.ego.speed, digits=6),
             limits=limits,
             target_speed=min(speed, MAX_SPEED),
-            group=self.own.get("group", ""),
+            group=self.own_properties.get("group", ""),
             source=f"OpenSCENARIO {Path(self.values.location).name}",
         )
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
         build_episode(scenario, self.graph, seed=0)  # reports any remaining error of the scenario
-        return Imported(
+        return ImportedScenario(
             scenario,
-            tuple(f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in self.lost.items()),
+            tuple(f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in self.omissions.items()),
         )
 
     def _centre(self, entity: Entity, pose: Pose) -> Pose:
-        return shifted(pose, *entity.centre) if any(entity.centre) else pose
+        return move_pose(pose, *entity.centre) if any(entity.centre) else pose
 
     # ------------------------------------------------------------ the start
 
     def _start(self) -> dict[str, str]:
         """Read Init; return the states of signals by id, and by number for those that are not in the map."""
-        assignments = (element.partition("=") for element in self.own.get("signals", "").split())
+        assignments = (element.partition("=") for element in self.own_properties.get("signals", "").split())
         forced_signals = {f"ssad:{signal}": state for signal, _, state in assignments}
         for action in self.root.iterfind("Storyboard/Init/Actions/GlobalAction"):
             element = action.find("InfrastructureAction/TrafficSignalAction/TrafficSignalStateAction")
             if element is not None:
                 forced_signals[self.values.text(element, "name")] = self.values.text(element, "state")
             else:
-                self._lose("at the start", action)
+                self._record_omission("at the start", action)
         for agent_actions in self.root.iterfind("Storyboard/Init/Actions/Private"):
             entity = self.triggers.referenced_entity(agent_actions)
             for action in agent_actions:
@@ -181,7 +181,7 @@ class _Reader:
                 elif element.find("SpeedAction") is not None:
                     entity.speed = self._speed(entity, element)
                 elif element.tag != "TeleportAction":
-                    self._lose(f"at the start of '{entity.name}'", action)
+                    self._record_omission(f"at the start of '{entity.name}'", action)
         return forced_signals
 
     def _driver(self, entity: Entity, action: Element) -> None:
@@ -196,14 +196,14 @@ class _Reader:
                 if name in ("autopilot", "blind") and "target_speed" in properties:
                     entity.policy = name
                 else:
-                    self.lost[f"controller '{name}' of '{entity.name}'"] += 1
+                    self.omissions[f"controller '{name}' of '{entity.name}'"] += 1
         if action.find(".//CatalogReference") is not None:
-            self.lost[f"controller of '{entity.name}' in a catalogue"] += 1
+            self.omissions[f"controller of '{entity.name}' in a catalogue"] += 1
 
-    def _lose(self, context: str, action: Element) -> None:
+    def _record_omission(self, context: str, action: Element) -> None:
         """Name an action that has no counterpart: the innermost element whose name says what it does."""
         action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
-        self.lost[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
+        self.omissions[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
 
     def _speed(self, entity: Entity, action: Element) -> float:
         target = action.find("SpeedAction/SpeedActionTarget/AbsoluteTargetSpeed")
@@ -212,14 +212,16 @@ class _Reader:
         else:
             relative = action.find("SpeedAction/SpeedActionTarget/RelativeTargetSpeed")
             if relative is None:
-                raise self.values.fail("SpeedAction", "SpeedActionTarget is missing")
+                raise self.values.error("SpeedAction", "SpeedActionTarget is missing")
             other, value = self.triggers.referenced_entity(relative), self.values.number(relative, "value")
             is_delta = self.values.text(relative, "speedTargetValueType") == "delta"
             speed = other.speed + value if is_delta else other.speed * value
-            self.lost[f"a speed of '{entity.name}' that depends on '{other.name}' is fixed at {speed:g} m/s"] += 1
+            self.omissions[f"a speed of '{entity.name}' that depends on '{other.name}' is fixed at {speed:g} m/s"] += 1
         max_speed = MODELS[entity.model].max_speed
         if not 0.0 <= speed <= max_speed and not entity.ego:
-            self.lost[f"a speed of '{entity.name}' of {speed:g} m/s: a {entity.model} has 0 to {max_speed:g} m/s"] += 1
+            self.omissions[
+                f"a speed of '{entity.name}' of {speed:g} m/s: a {entity.model} has 0 to {max_speed:g} m/s"
+            ] += 1
             speed = min(max(speed, 0.0), max_speed)
         dynamics = action.find("SpeedAction/SpeedActionDynamics")
         if dynamics is not None and self.values.text(dynamics, "dynamicsShape") != "step":
@@ -227,31 +229,31 @@ class _Reader:
             rate = self.values.number(dynamics, "value")
             is_rate = self.values.text(dynamics, "dynamicsDimension") == "rate"
             if not is_rate or min(abs(rate - model.max_accel), abs(rate - model.max_brake)) > 1e-6:
-                self.lost["how fast speeds change: vehicles use full throttle or full brake"] += 1
+                self.omissions["how fast speeds change: vehicles use full throttle or full brake"] += 1
         return speed
 
     def _routing(self, entity: Entity, action: Element, begins: float | None) -> None:
         inner = action[0] if len(action) else action
         if inner.tag == "AcquirePositionAction":
             position = inner.find("Position")
-            if self.places.reads(position):
+            if self.places.is_supported(position):
                 entity.route = (self.places.pose(position, within=inner),)
                 return
         elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
             points = [waypoint.find("Position") for waypoint in inner.iterfind("Route/Waypoint")]
-            if all(self.places.reads(point) for point in points):
+            if all(self.places.is_supported(point) for point in points):
                 entity.route = _with_headings(points, tuple(self.places.pose(point, within=inner) for point in points))
                 return
         elif inner.tag == "FollowTrajectoryAction" and not entity.ego:
             self._trajectory(entity, inner, begins)
             return
-        self._lose(f"of '{entity.name}'", action)
+        self._record_omission(f"of '{entity.name}'", action)
 
     def _trajectory(self, entity: Entity, action: Element, begins: float | None) -> None:
         vertices = action.findall(".//Shape/Polyline/Vertex")
         points = [vertex.find("Position") for vertex in vertices]
-        if len(vertices) < 2 or not all(self.places.reads(point) for point in points):
-            self.lost[f"a trajectory of '{entity.name}' that is no polyline of places that are read"] += 1
+        if len(vertices) < 2 or not all(self.places.is_supported(point) for point in points):
+            self.omissions[f"a trajectory of '{entity.name}' that is no polyline of places that are read"] += 1
             return
         read_poses = tuple(self.places.pose(point, within=action) for point in points)
         poses = tuple(self._centre(entity, pose) for pose in _with_headings(points, read_poses))
@@ -264,7 +266,7 @@ class _Reader:
         )
         if self.values.text(timing, "domainAbsoluteRelative") == "relative":
             if begins is None:
-                self.lost[f"the trigger of the trajectory of '{entity.name}': it begins with the episode"] += 1
+                self.omissions[f"the trigger of the trajectory of '{entity.name}': it begins with the episode"] += 1
             offset += begins or 0.0
         times = [self.values.number(vertex, "time") * scale + offset for vertex in vertices]
         entity.rows = tuple((time, point.x, point.y, point.yaw) for time, point in zip(times, poses, strict=True))
@@ -276,7 +278,7 @@ class _Reader:
         actors = [self.triggers.referenced_entity(reference) for reference in references]
         events = group.findall("Maneuver/Event")
         if group.find("CatalogReference") is not None:
-            self.lost["a maneuver in a catalogue"] += 1
+            self.omissions["a maneuver in a catalogue"] += 1
         for event in events:
             label = self.values.text(event, "name", "")
             for action in event.iterfind("Action"):
@@ -290,27 +292,27 @@ class _Reader:
     def _global(self, action: Element, event: Element, label: str) -> None:
         entity_action = action.find("EntityAction")
         if entity_action is None:
-            self._lose(f"in event '{label}'", action)
+            self._record_omission(f"in event '{label}'", action)
             return
         entity = self.triggers.referenced_entity(entity_action)
-        condition = self._when(event, entity, label)
+        condition = self._start_condition(event, entity, label)
         if entity_action.find("AddEntityAction") is not None:
             if not entity.rows and (condition is None or condition.kind != "always"):
-                self.lost[f"'{entity.name}' is there from the start, not from event '{label}' on"] += 1
+                self.omissions[f"'{entity.name}' is there from the start, not from event '{label}' on"] += 1
         elif condition is not None and condition.kind == "time":
             entity.leaves = condition.value
         else:
-            self.lost[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
+            self.omissions[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
 
     def _act(self, entity: Entity, action: Element, event: Element, label: str) -> None:
         inner = action[0] if len(action) else action
         if entity.ego:
-            self.lost[f"event '{label}' of the ego: the system under test drives it"] += 1
+            self.omissions[f"event '{label}' of the ego: the system under test drives it"] += 1
             return
         if inner.find("SpeedAction") is not None:
             conditions = self.triggers.conditions(event, entity, label)
             if conditions is None and entity.phases:
-                self.lost[f"event '{label}': when it begins is not known"] += 1
+                self.omissions[f"event '{label}': when it begins is not known"] += 1
                 return
             *waiting_conditions, final_condition = conditions or (PhaseTrigger("always"),)
             previous_speed = (
@@ -321,18 +323,18 @@ class _Reader:
             entity.phases = (*entity.phases, *waiting_phases, Phase(self._speed(entity, inner), final_condition))
             entity.event = label
         elif inner.tag == "RoutingAction":
-            condition = self._when(event, entity, label)
+            condition = self._start_condition(event, entity, label)
             start_times = {"always": 0.0, "time": condition.value if condition else 0.0}
             start_time = start_times.get(condition.kind) if condition else None
             if start_time is None and inner.find("FollowTrajectoryAction//Timing") is None:
-                self.lost[f"the trigger of event '{label}': '{entity.name}' keeps that path from the start"] += 1
+                self.omissions[f"the trigger of event '{label}': '{entity.name}' keeps that path from the start"] += 1
             self._routing(entity, inner, start_time)
         elif inner.find("LaneChangeAction") is not None:
-            self._lane_change(entity, inner, self._when(event, entity, label), label)
+            self._lane_change(entity, inner, self._start_condition(event, entity, label), label)
         else:
-            self._lose(f"in event '{label}'", action)
+            self._record_omission(f"in event '{label}'", action)
 
-    def _when(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
+    def _start_condition(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
         """Return the single condition of a trigger; None also if it is a sequence."""
         conditions = self.triggers.conditions(event, entity, label)
         return conditions[0] if conditions is not None and len(conditions) == 1 else None
@@ -349,7 +351,7 @@ class _Reader:
             else None
         )
         if target is None or start_distance is None or entity.change is not None:
-            self.lost[f"LaneChangeAction in event '{label}': it is not known where it begins"] += 1
+            self.omissions[f"LaneChangeAction in event '{label}': it is not known where it begins"] += 1
             return
         dynamics = action.find("LaneChangeAction/LaneChangeActionDynamics")
         length = _CHANGE
@@ -394,7 +396,7 @@ class _Reader:
                 limits = replace(limits, max_distance=self.values.number(distance_condition, "value"))
             elif name != "end of the route" and condition.find(".//CollisionCondition") is None:
                 condition_tags = [element.tag for element in condition.iter() if element.tag.endswith("Condition")]
-                self.lost[f"{condition_tags[-1]} of the stop trigger"] += 1
+                self.omissions[f"{condition_tags[-1]} of the stop trigger"] += 1
         if times:
             limits = replace(limits, max_time=min(times), max_steps=math.ceil(min(times) / STEP))
         return limits
@@ -411,7 +413,7 @@ class _Reader:
             )
         if points:
             return (start, *points)
-        self.lost[f"the ego has no route: {WAY:g} m along its lane"] += 1
+        self.omissions[f"the ego has no route: {WAY:g} m along its lane"] += 1
         path = lane_path(self.graph, start_lane, WAY)
         if len(path) < 3:
             raise RouteError(f"{self.values.location}: the road ends before the ego '{self.ego.name}'")
@@ -432,15 +434,15 @@ class _Reader:
             if rows[-1][0] < min(until, entity.leaves):
                 rows.append((until + 1.0, *rows[-1][1:]))  # it stays at the end of its trajectory
             if entity.phases:
-                self.lost[f"speeds of '{entity.name}': its trajectory has times"] += 1
+                self.omissions[f"speeds of '{entity.name}': its trajectory has times"] += 1
             return Actor(entity.name, entity.model, Pose(*rows[0][1:]), trajectory=tuple(rows))
         if math.isfinite(entity.leaves):
-            self.lost[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
+            self.omissions[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
         pose = self._centre(entity, self.places.start(entity.name, within=self.root))
         model = MODELS[entity.model]
         if model.max_speed == 0.0:
             if entity.phases or entity.path:
-                self.lost[f"what '{entity.name}' does: a {entity.model} stands still"] += 1
+                self.omissions[f"what '{entity.name}' does: a {entity.model} stands still"] += 1
             return Actor(entity.name, entity.model, pose)
         if entity.policy:
             path = tuple((point.x, point.y) for point in entity.route) if len(entity.route) > 1 else ()
@@ -449,7 +451,7 @@ class _Reader:
         phases = entity.phases
         if entity.speed > 0.0:
             phases = (Phase(min(entity.speed, model.max_speed)), *phases)
-            self.lost[f"'{entity.name}' starts from rest, and then goes for {entity.speed:g} m/s"] += 1
+            self.omissions[f"'{entity.name}' starts from rest, and then goes for {entity.speed:g} m/s"] += 1
         return Actor(entity.name, entity.model, pose, phases=phases, path=self._path(entity, pose) if phases else ())
 
     def _path(self, entity: Entity, pose: Pose) -> tuple[tuple[float, float], ...]:
@@ -464,7 +466,7 @@ class _Reader:
             try:
                 return tuple((x, y) for x, y in route_along(self.graph, points).xy.tolist())
             except RouteError:
-                self.lost[f"the route of '{entity.name}', which the town's lanes do not allow"] += 1
+                self.omissions[f"the route of '{entity.name}', which the town's lanes do not allow"] += 1
         place = self.places.lane_under(pose)
         if place is None:
             return ()
@@ -500,18 +502,18 @@ class _Reader:
                 (candidate for candidate in SignalState if candidate.name.lower() == state_name.strip().lower()), None
             )
             if state is None or name not in signal_numbers:
-                self.lost[f"state '{state_name[:40]}' of signal '{name[:40]}'"] += 1
+                self.omissions[f"state '{state_name[:40]}' of signal '{name[:40]}'"] += 1
             else:
                 forced_states[signal_numbers[name]] = state
         end_time = 60.0
-        if "signals_until" in self.own:
+        if "signals_until" in self.own_properties:
             try:
-                end_time = float(self.own["signals_until"])
+                end_time = float(self.own_properties["signals_until"])
             except ValueError:
-                raise self.values.fail("Property", "ssad.signals_until is not a number") from None
+                raise self.values.error("Property", "ssad.signals_until is not a number") from None
         plan = plan_of(self.graph, line, forced_states, end_time)
         if plan is None:
-            self.lost[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
+            self.omissions[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
 
 

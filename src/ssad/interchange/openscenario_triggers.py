@@ -19,11 +19,11 @@ _GREATER, _LESS = ("greaterThan", "greaterOrEqual"), ("lessThan", "lessOrEqual")
 _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCondition")
 
 
-class Triggers:
-    """The triggers of a document; triggers without a counterpart are counted in `lost`."""
+class TriggerReader:
+    """The triggers of a document; triggers without a counterpart are counted in `omissions`."""
 
-    def __init__(self, places: PositionReader, entities: Mapping[str, Entity], lost: Counter[str]) -> None:
-        self.values, self.places, self.entities, self.lost = places.values, places, entities, lost
+    def __init__(self, places: PositionReader, entities: Mapping[str, Entity], omissions: Counter[str]) -> None:
+        self.values, self.places, self.entities, self.omissions = places.values, places, entities, omissions
         self.ego = next(entity for entity in entities.values() if entity.ego)
         self._order = [
             name for name, candidate in entities.items() if not candidate.ego and candidate.placed
@@ -33,7 +33,7 @@ class Triggers:
         """Return the entity that an element refers to. FormatError if there is none of that name."""
         name = self.values.text(element, "entityRef")
         if name not in self.entities:
-            raise self.values.fail(element, f"there is no entity '{name}'")
+            raise self.values.error(element, f"there is no entity '{name}'")
         return self.entities[name]
 
     def conditions(self, event: Element, entity: Entity, label: str) -> tuple[PhaseTrigger, ...] | None:
@@ -55,14 +55,16 @@ class Triggers:
                 None,
             )
             if condition_type is None:
-                raise self.values.fail(condition, f"the condition of '{label}' is empty")
+                raise self.values.error(condition, f"the condition of '{label}' is empty")
             delay = max(self.values.number(condition, "delay", 0.0), 0.0)
             if condition_type.tag == "StoryboardElementStateCondition":
                 state = self.values.text(condition_type, "state")
                 if state not in ("runningState", "completeState", "startTransition"):
                     unread.append(f"{condition_type.tag} {state}")
                 elif delay and self.values.text(condition_type, "storyboardElementRef") != entity.event:
-                    self.lost[f"the delay of the trigger of '{label}' after another event than the one before"] += 1
+                    self.omissions[
+                        f"the delay of the trigger of '{label}' after another event than the one before"
+                    ] += 1
                 elif delay:
                     delays.append(PhaseTrigger("after", delay))
                     completed += state == "completeState"
@@ -78,14 +80,14 @@ class Triggers:
                 alternatives.append(sequence)
         # Our writer gives each delay for a running and for a completed event; other files may have only the latter.
         if delays and completed == len(delays):
-            self.lost[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
+            self.omissions[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
         required = [sequence for sequence in alternatives if sequence != (PhaseTrigger("always"),)] or (
             [] if delays else alternatives
         )
         for unread_tag in unread:
-            self.lost[f"{unread_tag} of the trigger of '{label}'"] += 1
+            self.omissions[f"{unread_tag} of the trigger of '{label}'"] += 1
         if len(required) > 1:
-            self.lost[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
+            self.omissions[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
         if required or delays:
             return (*delays[:1], *(required[0] if required else ()))
         return None if unread else (PhaseTrigger("always"),)
@@ -110,11 +112,11 @@ class Triggers:
                 return None
             if self.values.text(condition_type, "freespace", "false") == "true":
                 value += 0.5 * (MODELS[self.ego.model].length + MODELS[other_entities[0].model].length)
-                self.lost[
+                self.omissions[
                     "distances between bodies are taken as those between their centres, half the lengths added"
                 ] += 1
             if distance_type == "longitudinal":
-                self.lost["distances along the road are taken as straight ones"] += 1
+                self.omissions["distances along the road are taken as straight ones"] += 1
             if other_entities[0].name not in self._order:
                 return None
             return PhaseTrigger("ego_distance", value, self._order.index(other_entities[0].name))
@@ -122,14 +124,20 @@ class Triggers:
             condition_type.tag == "DistanceCondition" and rule in _LESS
         )
         position = condition_type.find("Position")
-        if is_reach and triggering == [self.ego] and entity.placed and not entity.ego and self.places.reads(position):
+        if (
+            is_reach
+            and triggering == [self.ego]
+            and entity.placed
+            and not entity.ego
+            and self.places.is_supported(position)
+        ):
             # a waiting actor stands still, so the place is a distance from it
             target, start = (
                 self.places.pose(position, within=condition_type),
                 self.places.start(entity.name, within=condition_type),
             )
             tolerance = self.values.number(condition_type, "tolerance", value)
-            self.lost[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
+            self.omissions[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
             gap = math.dist((target.x, target.y), (start.x, start.y))
             return PhaseTrigger("ego_distance", gap + tolerance, self._order.index(entity.name))
         return None

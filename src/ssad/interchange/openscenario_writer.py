@@ -71,7 +71,7 @@ class _Writer:
         self.episode, self.graph, self.signals = episode, graph, signals
         limits = episode.limits
         self.dt, self.until = dt, min(limits.max_steps * dt, limits.max_time)
-        self.lost: list[str] = []
+        self.omissions: list[str] = []
         self.names = _unique([agent.name for agent in episode.agents])
 
     def write(self, network: str) -> tuple[str, tuple[str, ...]]:
@@ -107,7 +107,7 @@ class _Writer:
         self._stop(_node(storyboard, "StopTrigger"))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
-        return text, tuple(self.lost)
+        return text, tuple(self.omissions)
 
     # ------------------------------------------------------------ entities
 
@@ -166,16 +166,16 @@ class _Writer:
                 state=SignalState(state).name.lower(),
             )
         if unmapped_count:
-            self.lost.append(
+            self.omissions.append(
                 f"{unmapped_count} signals that are forced are not in the map: other programs do not know them"
             )
         if self.episode.signal_override and self.episode.override_until < self.until:
-            self.lost.append(f"signals are forced only until {self.episode.override_until:g} s: others keep them")
+            self.omissions.append(f"signals are forced only until {self.episode.override_until:g} s: others keep them")
         uncontrolled_count = int((~self.graph.signal_virtual).sum()) - len(
             set(self.episode.signal_override) & set(self.signals)
         )
         if uncontrolled_count:
-            self.lost.append(f"the programme of {uncontrolled_count} other signals of the town is not written")
+            self.omissions.append(f"the programme of {uncontrolled_count} other signals of the town is not written")
         for name, agent in zip(self.names, self.episode.agents, strict=True):
             if agent.trajectory and agent.trajectory[0][0] > 0.0:
                 continue  # an event adds it later
@@ -189,7 +189,9 @@ class _Writer:
             if agent is self._ego or policy:
                 self._driver(agent_actions, agent, policy or "system under test")
             if agent.wake_distance > 0.0:
-                self.lost.append(f"{name} waits until the ego is within {agent.wake_distance:g} m: it starts at once")
+                self.omissions.append(
+                    f"{name} waits until the ego is within {agent.wake_distance:g} m: it starts at once"
+                )
 
     def _driver(self, private: Element, agent: EpisodeAgent, driver: str) -> None:
         controller_action = _node(_node(_node(private, "PrivateAction"), "ControllerAction"), "AssignControllerAction")
@@ -363,7 +365,9 @@ class _Writer:
                 entity_condition = _by_entity(_node(trigger, "ConditionGroup"), f"collision with {name}", ego)
                 _node(_node(entity_condition, "CollisionCondition"), "EntityRef", entityRef=name)
         elif limits.contact == "remove":
-            self.lost.append("who touches the ego is taken away: there is no such action, contacts are only counted")
+            self.omissions.append(
+                "who touches the ego is taken away: there is no such action, contacts are only counted"
+            )
         entity_condition = _by_entity(_node(trigger, "ConditionGroup"), "end of the route", ego)
         _position(_node(entity_condition, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1])
 

@@ -24,13 +24,13 @@ from ssad.core.generators import Base, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
-from ssad.core.safeio import home, make_folder, read_text, write_atomic
+from ssad.core.safeio import home_folder, make_folder, read_text, write_atomic
 from ssad.core.seeding import digest
 from ssad.core.types import F64, Actor, EpisodeLimits, LaneType, Pose, Scenario
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.frozen import agent_pose, rounded_rows, stopping
+from ssad.scenarios.dynamic.frozen import agent_pose, extend_by_stop, round_rows
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path
 from ssad.world.roads import load_town, route_along, town_names, town_xodr
 from ssad.world.roads.query import nearest_all
@@ -49,7 +49,7 @@ _MOST: Final = 60.0  # m/s
 
 
 @dataclass(frozen=True)
-class Program:
+class ScenicProgram:
     """A Scenic program, compiled for a town.
 
     Attributes:
@@ -66,21 +66,21 @@ class Program:
 
 
 @dataclass(frozen=True)
-class Sampled:
+class SampledScenario:
     """A sample of a program.
 
     Attributes:
         scenario: The scenario.
-        ended: Scenic's reason for the end of the simulation.
-        lost: Features of the simulation that the scenario does not carry, one line each.
+        end_reason: Scenic's reason for the end of the simulation.
+        omissions: Features of the simulation that the scenario does not carry, one line each.
     """
 
     scenario: Scenario
-    ended: str
-    lost: tuple[str, ...]
+    end_reason: str
+    omissions: tuple[str, ...]
 
 
-def load_program(path: Path, town: str | None = None, parameters: Mapping[str, Any] | None = None) -> Program:
+def load_program(path: Path, town: str | None = None, parameters: Mapping[str, Any] | None = None) -> ScenicProgram:
     """Compile a program.
 
     Args:
@@ -113,10 +113,10 @@ def load_program(path: Path, town: str | None = None, parameters: Mapping[str, A
         if compiled.egoObject is None:
             raise ConfigError(f"{path}: it has no ego")
     town_name = town or Path(str(compiled.params.get("map", ""))).stem
-    return Program(path, town_name, load_town(town_name), compiled)
+    return ScenicProgram(path, town_name, load_town(town_name), compiled)
 
 
-def sample(program: Program, seed: int, *, steps: int = STEPS, name: str | None = None) -> Sampled:
+def sample(program: ScenicProgram, seed: int, *, steps: int = STEPS, name: str | None = None) -> SampledScenario:
     """Draw a scene, simulate it, and convert the simulation to a scenario.
 
     Args:
@@ -182,9 +182,9 @@ class ScenicSearch:
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Return the next samples of each base; samples that meet no requirements are left out."""
-        return [self._of(base_index, count) for base_index in range(len(self._bases))]
+        return [self._base_proposals(base_index, count) for base_index in range(len(self._bases))]
 
-    def _of(self, b: int, count: int) -> list[Proposal]:
+    def _base_proposals(self, b: int, count: int) -> list[Proposal]:
         base, proposals = self._bases[b], []
         for _ in range(count):
             seed = int(digest("scenic", self._seeds[b], self._sample_counts[b])[:8], 16)
@@ -202,7 +202,7 @@ class ScenicSearch:
 
 def _map_file(town: str) -> Path:
     """Return the file of a town's map for Scenic, which stores its own results beside it."""
-    path = make_folder(home() / "scenic") / f"{Path(town).stem}.xodr"
+    path = make_folder(home_folder() / "scenic") / f"{Path(town).stem}.xodr"
     text = town_xodr(town)
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_atomic(path, text)
@@ -250,11 +250,11 @@ def _suppress_output() -> Iterator[None]:
         yield
 
 
-def _scenario(program: Program, drive: Any, name: str, seed: int) -> Sampled:
+def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int) -> SampledScenario:
     rows = np.stack(drive.rows)
-    lost: list[str] = []
+    omissions: list[str] = []
     ego = rows[:, 0]
-    key_points, speed = _route(program, ego, lost)
+    key_points, speed = _route(program, ego, omissions)
     ego_route = route_along(program.graph, key_points)
     end_time = STEP * (len(rows) + 100)
     start_pose = Pose(*ego[0, :3].tolist())
@@ -276,13 +276,14 @@ def _scenario(program: Program, drive: Any, name: str, seed: int) -> Sampled:
         size = drive.sizes[index]
         if (
             index
-            and max(abs(extent - model_extent) for extent, model_extent in zip(size, _size(model), strict=True)) > 0.01
+            and max(abs(extent - model_extent) for extent, model_extent in zip(size, _model_size(model), strict=True))
+            > 0.01
         ):
-            lost.append(f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'")
-    return Sampled(scenario, str(drive.result.terminationReason), tuple(dict.fromkeys(lost)))
+            omissions.append(f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'")
+    return SampledScenario(scenario, str(drive.result.terminationReason), tuple(dict.fromkeys(omissions)))
 
 
-def _size(model: str) -> tuple[float, float]:
+def _model_size(model: str) -> tuple[float, float]:
     from ssad.world.models import MODELS
 
     return MODELS[model].length, MODELS[model].width
@@ -294,11 +295,11 @@ def _actor(drive: Any, rows: F64, index: int, until: float) -> Actor:
     trajectory = np.column_stack([time, rows[:, index, :3]])
     if np.hypot(*np.ptp(trajectory[:, 1:3], axis=0)) < STILL:
         return Actor(drive.names[index], drive.models[index], agent_pose(trajectory[0]))
-    kept_rows = rounded_rows(stopping(trajectory, until))
+    kept_rows = round_rows(extend_by_stop(trajectory, until))
     return Actor(drive.names[index], drive.models[index], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
 
 
-def _route(program: Program, ego: F64, lost: list[str]) -> tuple[tuple[Pose, ...], float]:
+def _route(program: ScenicProgram, ego: F64, omissions: list[str]) -> tuple[tuple[Pose, ...], float]:
     """Return the key points of the ego's route, and its speed at the start, m/s."""
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego[:, :2], axis=0).T))])
     start = Pose(*ego[0, :3].tolist())
@@ -308,14 +309,14 @@ def _route(program: Program, ego: F64, lost: list[str]) -> tuple[tuple[Pose, ...
         route = tuple(Pose(*ego[row_index, :3].tolist()) for row_index in row_indices)
         for extension in (BEYOND, 0.0):  # a system that does not stop where the program's ego did needs more route
             with contextlib.suppress(RouteError):
-                extended = (*route, *_ahead(program.graph, route[-1], extension)[1:]) if extension else route
+                extended = (*route, *_key_points_ahead(program.graph, route[-1], extension)[1:]) if extension else route
                 if route_along(program.graph, extended).length < 1.5 * distances[-1] + extension + 10.0:
                     return extended, float(ego[0, 3])
-        lost.append("the way of the ego, which leaves its lanes: its lane is its route")
-    return _ahead(program.graph, start), float(ego[0, 3])
+        omissions.append("the way of the ego, which leaves its lanes: its lane is its route")
+    return _key_points_ahead(program.graph, start), float(ego[0, 3])
 
 
-def _ahead(graph: LaneGraph, start: Pose, way: float = WAY) -> tuple[Pose, ...]:
+def _key_points_ahead(graph: LaneGraph, start: Pose, way: float = WAY) -> tuple[Pose, ...]:
     """Key points along the lane under a pose, so many metres."""
     lanes, distances, lane_distances = nearest_all(graph, (start.x, start.y), (LaneType.DRIVING,))
     places = [LanePosition(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]

@@ -55,7 +55,7 @@ class _Body:
     pedals: Pedals
     heading: float  # rad, of a walker's way
     pace: float  # m/s
-    turned: float = 0.0  # rad/s
+    yaw_change: float = 0.0  # rad/s
 
 
 class ScenicWorld(DrivingSimulator):  # type: ignore[misc]
@@ -178,8 +178,8 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
             "roll": 0,
             "velocity": Vector(body.speed * math.cos(direction), body.speed * math.sin(direction), 0.0),
             "speed": abs(body.speed),
-            "angularSpeed": body.turned,
-            "angularVelocity": Vector(0.0, 0.0, body.turned),
+            "angularSpeed": body.yaw_change,
+            "angularVelocity": Vector(0.0, 0.0, body.yaw_change),
         }
         if "elevation" in properties:
             state["elevation"] = 0.0
@@ -247,7 +247,7 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         state = self._world.state()
         for index, body in enumerate(self._bodies.values()):
             x, y, yaw = state.pose[0, index].tolist()
-            body.turned = float(wrap_angle(yaw - body.pose.yaw)) / STEP if self.rows else 0.0
+            body.yaw_change = float(wrap_angle(yaw - body.pose.yaw)) / STEP if self.rows else 0.0
             body.pose, body.speed = Pose(x, y, yaw), float(state.speed[0, index])
         self.rows.append(np.column_stack([state.pose[0], state.speed[0]]).astype(np.float64))
 

@@ -17,7 +17,7 @@ DEFAULT_CAP = 10.0
 """Largest TTC and PET, s: nothing later counts as a conflict (the cap of FREA's PET)."""
 
 
-def boxes(trace: EpisodeTrace) -> F64:
+def trace_boxes(trace: EpisodeTrace) -> F64:
     """Return the boxes [T, A, 5] of a trace: x, y, yaw, length, width."""
     shape = trace.x.shape
     size = [np.broadcast_to(value, shape) for value in (trace.length, trace.width)]
@@ -72,11 +72,11 @@ def ttc(trace: EpisodeTrace) -> F64:
 
     Both keep their speed and heading of the step. inf: not on a collision course, or not present.
     """
-    body_boxes = boxes(trace)
+    body_boxes = trace_boxes(trace)
     speed = trace.speed.astype(np.float64)
     velocity = np.stack([speed * np.cos(body_boxes[..., 2]), speed * np.sin(body_boxes[..., 2])], axis=-1)
     collision_time = time_to_collision(body_boxes[:, :1], body_boxes[:, 1:], velocity[:, :1] - velocity[:, 1:])
-    return np.where(_present(trace), collision_time, np.inf)
+    return np.where(_presence(trace), collision_time, np.inf)
 
 
 def min_ttc(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> float:
@@ -86,8 +86,8 @@ def min_ttc(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> float:
 
 def min_distance(trace: EpisodeTrace) -> float:
     """Least distance of the ego's box from another agent's, m; NaN if nobody else was ever present."""
-    body_boxes = boxes(trace)
-    present = _present(trace)
+    body_boxes = trace_boxes(trace)
+    present = _presence(trace)
     step, agent = np.nonzero(present)
     if len(step) == 0:
         return math.nan
@@ -102,7 +102,7 @@ def post_encroachment_time(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> 
     ego's box at t_i overlaps the other's at t_j, which is searched in steps of the trace, without a grid. A car
     that follows on the same path counts: its value is the time gap.
     """
-    body_boxes = boxes(trace)
+    body_boxes = trace_boxes(trace)
     steps = len(body_boxes)
     active = trace.active
     radius = 0.5 * np.hypot(trace.length, trace.width).astype(np.float64)
@@ -119,7 +119,7 @@ def post_encroachment_time(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> 
     return cap
 
 
-def _present(trace: EpisodeTrace) -> Bool:
+def _presence(trace: EpisodeTrace) -> Bool:
     return np.asarray(trace.active[:, 1:] & trace.active[:, :1])
 
 

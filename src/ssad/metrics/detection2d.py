@@ -122,8 +122,8 @@ def average_precision(
     truth: Boxes2D, detections: Boxes2D, *, labels: int, threshold: float = 0.5, max_detections: int = 100
 ) -> F64:
     """Return AP [labels], NaN for a label without ground truth; np.nanmean of it is COCO's AP at the threshold."""
-    matched = match_2d(truth, detections, labels=labels, threshold=threshold, max_detections=max_detections)
-    return matched.average_precision()
+    matches = match_2d(truth, detections, labels=labels, threshold=threshold, max_detections=max_detections)
+    return matches.average_precision()
 
 
 def _best(group: I64, score: F64, limit: int) -> I64:

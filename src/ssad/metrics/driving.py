@@ -180,8 +180,8 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         raise ValueError(f"trace {trace.key}: no rows")
     events = collision_events(trace)
     counts = {name: int(((trace.contact[events] & kind) != 0).sum()) for name, kind in COLLISIONS.items()}
-    off_road_metres, driven = off_road_distance(trace), float(trace.driven[-1])
-    off_road_fraction = min(off_road_metres / driven, 1.0) if driven > 0.0 else 0.0
+    off_road_metres, driven_length = off_road_distance(trace), float(trace.driven[-1])
+    off_road_fraction = min(off_road_metres / driven_length, 1.0) if driven_length > 0.0 else 0.0
     completion = min(max(float(trace.route_complete[-1]) / 100.0, 0.0), 1.0)
     deviation = _mean(trace.route_distance[1:])
     # bodies may touch between two rows
@@ -189,7 +189,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
     infractions = counts | {"red_lights": int(trace.red_light.sum())}
     stop_sign_count = int(trace.stop_sign.sum()) if stop_signs else None
     return EpisodeMetrics(
-        collision=collided(trace),
+        collision=has_collision(trace),
         collision_events=int(events.sum()),
         off_road=off_road_metres,
         off_road_fraction=off_road_fraction,
@@ -197,7 +197,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         route_completion=completion,
         route_following=1.0 - min(deviation / DIVISORS["DR"], 1.0) if math.isfinite(deviation) else math.nan,
         time=(len(trace.contact) - 1) * float(trace.dt),
-        driven=driven,
+        driven=driven_length,
         acceleration=mean_acceleration(trace),
         yaw_velocity=mean_yaw_velocity(trace),
         lane_invasions=int(trace.lane_invasion.sum()),
@@ -212,7 +212,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
     )
 
 
-def collided(trace: EpisodeTrace) -> bool:
+def has_collision(trace: EpisodeTrace) -> bool:
     """Return whether the ego hit anything.
 
     SafeBench reads its last record, whose collision flag stays set once raised.
@@ -322,7 +322,7 @@ def driving_score(completion: float, infractions: Mapping[str, int], off_road_fr
     return 100.0 * completion * factor * (1.0 - off_road_fraction)
 
 
-def normalised(name: str, value: float) -> float:
+def normalise_metric(name: str, value: float) -> float:
     """Return a metric of `DIVISORS` scaled to [0, 1], 1 the worst."""
     return min(value / DIVISORS[name], 1.0)
 

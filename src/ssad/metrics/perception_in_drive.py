@@ -9,10 +9,10 @@ import numpy as np
 
 from ssad.core.driving import Belief
 from ssad.core.frames import Camera
-from ssad.core.perception import I64, SIGN_MATCH_SHARE, Objects, Perceived, Tracks
+from ssad.core.perception import I64, SIGN_MATCH_SHARE, DrivePerception, Objects, Tracks
 from ssad.core.rotations import upright_poses
 from ssad.core.types import F64, AgentKind, Bool, EpisodeTrace
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 from ssad.metrics.detection import match
 from ssad.metrics.detection_boxes import BoxTable
 from ssad.metrics.tracking import ENOUGH, TrackedFrame, similarity_of, track_scores
@@ -52,7 +52,7 @@ def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Cam
         np.broadcast_to(size, (len(step_indices), *size.shape)),
         kind,
     )
-    is_unoccluded = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
+    is_unoccluded = is_visible(pose[:, 0, :2].astype(np.float32), truth, REACH)
     if not cameras:
         return np.asarray(is_unoccluded)
     ego_poses = upright_poses(pose[:, 0].astype(np.float64))
@@ -72,7 +72,7 @@ def _steps(trace: EpisodeTrace, records: Sequence[tuple[float, Any]]) -> list[in
     return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in records]
 
 
-def object_that_matters(trace: EpisodeTrace) -> int | None:
+def relevant_agent(trace: EpisodeTrace) -> int | None:
     """The agent that the ego touches first, or else the one that it comes nearest to; None: there is nobody else."""
     struck_agents = trace.contact_agent[trace.contact_agent > 0]
     if len(struck_agents):
@@ -85,7 +85,9 @@ def object_that_matters(trace: EpisodeTrace) -> int | None:
     return nearest_agent + 1 if np.isfinite(distances[:, nearest_agent]).any() else None
 
 
-def component_metrics(trace: EpisodeTrace, perceived: Perceived, *, phantom_score: float) -> dict[str, float | None]:
+def component_metrics(
+    trace: EpisodeTrace, perceived: DrivePerception, *, phantom_score: float
+) -> dict[str, float | None]:
     """Numbers of the component on the frames of a drive; None where there was nothing to measure.
 
     Args:
@@ -101,15 +103,15 @@ def component_metrics(trace: EpisodeTrace, perceived: Perceived, *, phantom_scor
         that are not there. believed: share of the steps with the object that matters in view in which it is believed
         where it is. switches: changes of its track. HOTA, MOTA and IDF1: see `track_metrics`.
     """
-    critical = object_that_matters(trace)
+    critical = relevant_agent(trace)
     critical_looks: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
     hit_count, visible_count, phantom_count, look_count = 0, 0, 0, 0
     look_tables: list[tuple[F64, Bool, Objects | None]] = []
     missed_agents: list[Bool] = []
     distance_errors: list[F64] = []
-    steps = _steps(trace, perceived.looks)
+    steps = _steps(trace, perceived.detections)
     for (_, detections), step, visible in zip(
-        perceived.looks, steps, in_view(trace, steps, perceived.cameras), strict=True
+        perceived.detections, steps, in_view(trace, steps, perceived.cameras), strict=True
     ):
         agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         look_tables.append((agent_positions, visible, detections))
@@ -148,7 +150,7 @@ def component_metrics(trace: EpisodeTrace, perceived: Perceived, *, phantom_scor
     metrics: dict[str, float | None] = {
         "AP": average_precision(look_tables),
         "recall": hit_count / visible_count if visible_count else None,
-        "missed_burst": _burst(missed_agents),
+        "missed_burst": _mean_miss_streak(missed_agents),
         "distance_share": float(np.sqrt(np.mean(np.concatenate(distance_errors) ** 2))) if distance_errors else None,
         "target_recall": _mean(rows[:, 1]),
         "distance_error": _mean(rows[np.isfinite(rows[:, 2]), 2]),
@@ -161,7 +163,7 @@ def component_metrics(trace: EpisodeTrace, perceived: Perceived, *, phantom_scor
     return metrics | _belief_metrics(trace, perceived, critical) | track_metrics(trace, perceived)
 
 
-def _burst(missed_by_look: Sequence[Bool]) -> float | None:
+def _mean_miss_streak(missed_by_look: Sequence[Bool]) -> float | None:
     """Return the mean number of successive looks that miss an object; `missed_by_look` has [A] for each look."""
     missed_table = np.array(missed_by_look, bool)
     if not missed_table.any():
@@ -170,14 +172,14 @@ def _burst(missed_by_look: Sequence[Bool]) -> float | None:
     return float(missed_table.sum() / run_starts.sum())
 
 
-def track_metrics(trace: EpisodeTrace, perceived: Perceived) -> dict[str, float | None]:
+def track_metrics(trace: EpisodeTrace, perceived: DrivePerception) -> dict[str, float | None]:
     """HOTA, MOTA and IDF1 of what is believed against who is in view, within 2 m; None: nobody ever was.
 
     A track on somebody who is out of view, whom the driver may well remember, counts neither for nor against.
     """
-    frames, steps = [], _steps(trace, perceived.known)
+    frames, steps = [], _steps(trace, perceived.tracks)
     for (_, tracks), step, visible in zip(
-        perceived.known, steps, in_view(trace, steps, perceived.cameras), strict=True
+        perceived.tracks, steps, in_view(trace, steps, perceived.cameras), strict=True
     ):
         agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         similarity = similarity_of(agent_positions, tracks.place, 2.0 * NEAR)
@@ -196,7 +198,7 @@ def track_metrics(trace: EpisodeTrace, perceived: Perceived) -> dict[str, float 
     return {"HOTA": scores.hota, "MOTA": scores.mota, "IDF1": scores.idf1}
 
 
-def sign_metrics(trace: EpisodeTrace, perceived: Perceived, signs: F64) -> dict[str, float | None]:
+def sign_metrics(trace: EpisodeTrace, perceived: DrivePerception, signs: F64) -> dict[str, float | None]:
     """Return metrics of the reading of stop signs in a drive; None without a sign before the ego.
 
     Args:
@@ -267,7 +269,7 @@ def average_precision(detections_by_look: Sequence[tuple[F64, Bool, Objects | No
     return float(scores.mean_dist_aps["car"])
 
 
-def cause_of_collision(trace: EpisodeTrace, perceived: Perceived) -> dict[str, Any] | None:
+def cause_of_collision(trace: EpisodeTrace, perceived: DrivePerception) -> dict[str, Any] | None:
     """Return the perception of the struck object in the three seconds before a collision; None without one.
 
     Returns:
@@ -316,10 +318,10 @@ def hard_braking(trace: EpisodeTrace, limit: float = 4.0) -> int:
     return int((brakes_hard & ~np.concatenate([[False], brakes_hard[:-1]])).sum())
 
 
-def phantom_stop(trace: EpisodeTrace, perceived: Perceived) -> float:
+def phantom_stop(trace: EpisodeTrace, perceived: DrivePerception) -> float:
     """Seconds that the ego stood (below 0.5 m/s) with something on the road ahead, within 20 m, that is not there."""
     standing_time = 0.0
-    for time, tracks in perceived.known:
+    for time, tracks in perceived.tracks:
         step = min(round(time / trace.dt), len(trace.x) - 1)
         if trace.speed[step, 0] > 0.5 or not len(tracks):
             continue
@@ -335,10 +337,10 @@ def phantom_stop(trace: EpisodeTrace, perceived: Perceived) -> float:
     return standing_time
 
 
-def _belief_metrics(trace: EpisodeTrace, perceived: Perceived, target: int | None) -> dict[str, float | None]:
-    is_believed, track_ids, steps = [], [], _steps(trace, perceived.known)
+def _belief_metrics(trace: EpisodeTrace, perceived: DrivePerception, target: int | None) -> dict[str, float | None]:
+    is_believed, track_ids, steps = [], [], _steps(trace, perceived.tracks)
     for (_, tracks), step, visible in zip(
-        perceived.known, steps, in_view(trace, steps, perceived.cameras), strict=True
+        perceived.tracks, steps, in_view(trace, steps, perceived.cameras), strict=True
     ):
         if target is None or not visible[target]:
             continue
@@ -350,15 +352,17 @@ def _belief_metrics(trace: EpisodeTrace, perceived: Perceived, target: int | Non
     return {"believed": _mean(np.array(is_believed)), "switches": switches}
 
 
-def _state(trace: EpisodeTrace, step: int, agent: int, perceived: Perceived) -> str:
+def _state(trace: EpisodeTrace, step: int, agent: int, perceived: DrivePerception) -> str:
     """Return the entry of `CAUSES` that holds for an agent at a step."""
     time = step * trace.dt
-    for record_time, tracks in perceived.known:
+    for record_time, tracks in perceived.tracks:
         if abs(record_time - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:
             return "known"
     if not in_view(trace, [step], perceived.cameras)[0, agent]:
         return "hidden"
-    last_look = [detections for record_time, detections in perceived.looks if record_time <= time + 0.5 * trace.dt][-1:]
+    last_look = [
+        detections for record_time, detections in perceived.detections if record_time <= time + 0.5 * trace.dt
+    ][-1:]
     if not last_look or last_look[0] is None or not len(last_look[0]):
         return "missed"
     agent_position = np.array([trace.x[step, agent], trace.y[step, agent]])

@@ -19,7 +19,7 @@ import numpy as np
 from ssad.core.geometry import obb_distance
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, EpisodeTrace
-from ssad.metrics.criticality import boxes, time_to_collision
+from ssad.metrics.criticality import time_to_collision, trace_boxes
 
 PSEUDO_COUNT: Final = 0.1
 
@@ -63,7 +63,7 @@ def motion_features(trace: EpisodeTrace, agent: int, road_edge: F64) -> dict[str
         off_road have one.
     """
     active_steps = np.flatnonzero(trace.active[:, agent])
-    dt, body_boxes = float(trace.dt), boxes(trace)
+    dt, body_boxes = float(trace.dt), trace_boxes(trace)
     speed = trace.speed[active_steps, agent].astype(np.float64)
     yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[active_steps, agent].astype(np.float64)))) / dt
     other_agents = [other_agent for other_agent in range(len(trace.kind)) if other_agent != agent]
@@ -98,14 +98,14 @@ def motion_features(trace: EpisodeTrace, agent: int, road_edge: F64) -> dict[str
     }
 
 
-def pooled(motions: Sequence[Mapping[str, F64]]) -> dict[str, F64]:
+def pool_motions(motions: Sequence[Mapping[str, F64]]) -> dict[str, F64]:
     """Return the values of several motions together, by feature."""
     return {name: np.concatenate([motion[name] for motion in motions] or [np.zeros(0)]) for name in FEATURES}
 
 
 def histogram(values: F64, feature: Feature) -> F64:
     """Return the probabilities [bins] with the pseudo-count; outliers count in the first or last bin."""
-    counts = np.bincount(_bin(values, feature), minlength=feature.bins) + PSEUDO_COUNT
+    counts = np.bincount(_bin_indices(values, feature), minlength=feature.bins) + PSEUDO_COUNT
     return np.asarray(counts / counts.sum())
 
 
@@ -121,7 +121,7 @@ def realism(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> float:
     total = weight = 0.0
     for name, feature in FEATURES.items():
         if len(motions[name]) and len(reference[name]):
-            probabilities = histogram(reference[name], feature)[_bin(motions[name], feature)]
+            probabilities = histogram(reference[name], feature)[_bin_indices(motions[name], feature)]
             total += feature.weight * math.exp(float(np.log(probabilities).mean()))
             weight += feature.weight
     return total / weight if weight else math.nan
@@ -139,6 +139,6 @@ def wasserstein(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> dic
     }
 
 
-def _bin(values: F64, feature: Feature) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def _bin_indices(values: F64, feature: Feature) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     fraction = (np.asarray(values, np.float64) - feature.low) / (feature.high - feature.low)
     return np.clip(np.floor(fraction * feature.bins), 0, feature.bins - 1).astype(np.int64)

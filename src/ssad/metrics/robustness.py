@@ -77,8 +77,8 @@ def _table(scores: Scores, table_name: str) -> tuple[list[str], F64]:
     names = list(scores)
     counts = {len(scores[name]) for name in names}
     if counts == {0} or len(counts) > 1:
-        listed = ", ".join(f"{name}: {len(scores[name])}" for name in names)
-        raise ConfigError(f"{table_name}: every shift needs the same severities, but there are {listed}")
+        rows_by_name = ", ".join(f"{name}: {len(scores[name])}" for name in names)
+        raise ConfigError(f"{table_name}: every shift needs the same severities, but there are {rows_by_name}")
     values = np.array([[math.nan if score is None else score for score in scores[name]] for name in names], np.float64)
     if np.isnan(values).any():
         row, column = np.argwhere(np.isnan(values))[0].tolist()

@@ -30,7 +30,7 @@ MAX_CLUSTERS = 10**9
 
 
 @dataclass(frozen=True)
-class Sample:
+class CaseSample:
     """Cases in clusters.
 
     Attributes:
@@ -44,7 +44,7 @@ class Sample:
     typical_size: float
 
     @classmethod
-    def of(cls, clusters: Iterable[str]) -> Sample:
+    def of(cls, clusters: Iterable[str]) -> CaseSample:
         """Return the sample of cases whose clusters are named."""
         _, sizes = np.unique(list(clusters), return_counts=True)
         return cls(float(len(sizes)), float(sizes.mean()), float((sizes**2).sum() / sizes.sum()))
@@ -76,7 +76,7 @@ class FlipRate:
     rate: float
     difference: float
     mean_rate: float
-    sample: Sample
+    sample: CaseSample
     design_effect: float
     correlation: float
     rate_correlation: float
@@ -99,7 +99,7 @@ def flip_rate(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -
         return None
     clusters = [pair[0].cluster for pair in pairs]
     outcomes = np.array([[case_value.value for case_value in pair] for pair in pairs])
-    sample = Sample.of(clusters)
+    sample = CaseSample.of(clusters)
     differences = outcomes[:, 0] - outcomes[:, 1]
     design_effect = _design_effect(differences, clusters)
     rate_effects = [effect for effect in (_design_effect(values, clusters) for values in outcomes.T) if effect >= 0.0]
@@ -114,7 +114,7 @@ def flip_rate(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -
     )
 
 
-def power(difference: float, flip_rate: float, sample: Sample, correlation: float) -> float:
+def power(difference: float, flip_rate: float, sample: CaseSample, correlation: float) -> float:
     """Return the probability that the interval of a paired difference leaves out 0, if the true one is `difference`.
 
     The limits are those of `ssad.metrics.intervals.difference_limits` at the true shares, at the effective number of
@@ -130,7 +130,7 @@ def power(difference: float, flip_rate: float, sample: Sample, correlation: floa
         correlation: Correlation of the differences within a cluster.
 
     Source:
-        Connor, "Sample size for testing differences in proportions for the paired-sample design" (1987).
+        Connor, "CaseSample size for testing differences in proportions for the paired-sample design" (1987).
     """
     from scipy.special import stdtr
 
@@ -142,7 +142,7 @@ def power(difference: float, flip_rate: float, sample: Sample, correlation: floa
     return float(stdtr(sample.clusters - 1.0, float(low) / math.sqrt(variance)))
 
 
-def unpaired_power(difference: float, mean_rate: float, sample: Sample, correlation: float) -> float:
+def unpaired_power(difference: float, mean_rate: float, sample: CaseSample, correlation: float) -> float:
     """Return the probability that two rates of separate cases are found to differ, each from as many cases.
 
     Args:
@@ -162,12 +162,12 @@ def unpaired_power(difference: float, mean_rate: float, sample: Sample, correlat
     return float(stdtr(freedom, difference / math.sqrt(variance) - float(t_quantile(freedom))))
 
 
-def necessary_clusters(power_of: Callable[[Sample], float], sample: Sample, *, target: float) -> int | None:
+def necessary_clusters(power_of: Callable[[CaseSample], float], sample: CaseSample, *, target: float) -> int | None:
     """Return the number of clusters, as large as those of a sample, from which on a difference is detected.
 
     Args:
         power_of: Power by sample.
-        sample: Sample that sets the sizes of the clusters.
+        sample: CaseSample that sets the sizes of the clusters.
         target: Power that is wanted.
 
     Returns:
@@ -180,7 +180,7 @@ def necessary_clusters(power_of: Callable[[Sample], float], sample: Sample, *, t
     return _first(is_enough, MIN_ROUTES)
 
 
-def detectable_difference(flip_rate: float, sample: Sample, correlation: float, *, target: float) -> float | None:
+def detectable_difference(flip_rate: float, sample: CaseSample, correlation: float, *, target: float) -> float | None:
     """Return the least difference, in hundredths, that a sample detects; None: none, or too few clusters.
 
     Args:
@@ -212,7 +212,7 @@ def _first(is_enough: Callable[[int], bool], start: int) -> int | None:
     return high
 
 
-def _expected_limits(share: float, sample: Sample, correlation: float) -> ConfidenceLimits:
+def _expected_limits(share: float, sample: CaseSample, correlation: float) -> ConfidenceLimits:
     """Return the limits of a share at its true value, with the effective number that clusters are expected to show."""
     cases, min_effective = sample.cases, sample.cases / sample.typical_size
     if sample.typical_size == 1.0:
@@ -262,7 +262,7 @@ def _design_effect(values: F64, clusters: list[str]) -> float:
     return float((sums**2).sum()) * cluster_count / (cluster_count - 1.0) / (len(values) * variance)
 
 
-def _correlation(design_effect: float, sample: Sample) -> float:
+def _correlation(design_effect: float, sample: CaseSample) -> float:
     """Return the correlation within clusters that makes a design effect, from 0 to 1."""
     if sample.typical_size == 1.0:
         return 0.0

@@ -72,13 +72,13 @@ def track_scores(frames: Sequence[TrackedFrame]) -> TrackScores | None:
     """
     if not sum(len(frame.objects) for frame in frames):
         return None
-    renumbered = _numbered(frames)
+    renumbered = _renumber(frames)
     hota, detection, association = _hota(renumbered)
-    mota, switches = _clear(renumbered)
+    mota, switches = _clear_mot(renumbered)
     return TrackScores(hota, detection, association, mota, _idf1(renumbered), switches)
 
 
-def _numbered(frames: Sequence[TrackedFrame]) -> list[TrackedFrame]:
+def _renumber(frames: Sequence[TrackedFrame]) -> list[TrackedFrame]:
     """Renumber objects and tracks from 0."""
     no_identities = [np.zeros(0, np.int64)]
     objects = np.unique(np.concatenate([*no_identities, *(frame.objects for frame in frames)]))
@@ -130,7 +130,7 @@ def _hota(frames: Sequence[TrackedFrame]) -> tuple[float, float, float]:
     return float(np.sqrt(detection * association).mean()), float(detection.mean()), float(association.mean())
 
 
-def _clear(frames: Sequence[TrackedFrame]) -> tuple[float, int]:
+def _clear_mot(frames: Sequence[TrackedFrame]) -> tuple[float, int]:
     """Return MOTA and switches; pairs of the previous frame take precedence."""
     objects, _ = _counts(frames)
     latest_track, previous_track = (

@@ -23,7 +23,7 @@ from ssad.core.types import (
 from ssad.rendering.scene_objects import thin_shares
 from ssad.rendering.street import STYLES, Street, build_street, cached_street
 from ssad.scenarios.dynamic.episode import forced_signals
-from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.world.models import model
 from ssad.world.roads.router import random_route
 
@@ -85,7 +85,7 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
     if not len(lanes):
         raise MapError(f"town '{graph.name}' has no driving lane of 25 m or more; nothing can be recorded there")
     route = _long_route(graph, lanes, rng)
-    ego_speed = float(rng.uniform(7, 10)) * _haste(route)
+    ego_speed = float(rng.uniform(7, 10)) * _speed_factor(route)
     ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, _pose(route), target_speed=ego_speed, route=route)
     agents = [ego]
     # Route points are 1 m apart; every fifth is enough to measure distances of 120 m.
@@ -107,12 +107,12 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
         body = str(rng.choice(list(body_shares), p=list(body_shares.values())))
         agent_route = random_route(graph, lane, distance, 400.0, rng)
         for _ in range(ROUTE_TRIES):
-            if fits(body, agent_route):
+            if fits_route(body, agent_route):
                 break
             agent_route = random_route(graph, lane, distance, 400.0, rng)
         else:
             body = "compact"
-        if body == "bicycle" and _haste(agent_route) > 1.0:
+        if body == "bicycle" and _speed_factor(agent_route) > 1.0:
             body = "motorcycle"  # nobody cycles on a motorway
         clearance = 0.5 * model(body).length + 4.0
         if any(
@@ -121,7 +121,7 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
             for other_agent in agents
         ):
             continue
-        desired_speed = 5.0 if body == "bicycle" else float(rng.uniform(5.5, 11.0)) * _haste(agent_route)
+        desired_speed = 5.0 if body == "bicycle" else float(rng.uniform(5.5, 11.0)) * _speed_factor(agent_route)
         speed_limit = float(graph.speed_limit[lane])
         pose = Pose(x, y, yaw)
         agents.append(
@@ -158,7 +158,7 @@ def _long_route(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator)
     return longest_route
 
 
-def _haste(route: Route) -> float:
+def _speed_factor(route: Route) -> float:
     """Return the factor on town speeds that agents want to drive on this route, where roads and bends allow it."""
     max_limit = float(route.speed_limit.max())
     return max_limit / TOWN_SPEED if max_limit > FAST else 1.0

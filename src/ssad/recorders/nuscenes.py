@@ -22,7 +22,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import visibility_token
 from ssad.core.rotations import matrix_to_quaternion, upright_pose, wrap_angle
 from ssad.core.seeding import digest, generator
@@ -142,7 +142,7 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
     return by_kind[kind or str(drawn_kind)]
 
 
-def weather_words(weather: SceneWeather) -> str:
+def describe_weather(weather: SceneWeather) -> str:
     """Describe a weather in words, such as "sun 40 degrees above the horizon, clouds 35 %"."""
     sun_degrees = round(np.degrees(weather.sun_height))
     phrases = [
@@ -172,7 +172,7 @@ def attributes_of(placed_object: PlacedObject) -> tuple[str, ...]:
         return ("cycle.with_rider",) if body.style == "ridden" else ("cycle.without_rider",)
     if body.kind in ("traffic_cone", "barrier"):
         return ()
-    return ("vehicle.parked",) if body.parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
+    return ("vehicle.parked",) if body.is_parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
 
 
 def ego_at(trace: EpisodeTrace, time: float) -> F64:
@@ -194,25 +194,25 @@ def _street(town: str, streets: str, key: tuple[object, ...]) -> Street:
     return drive_street(load_town(town), streets, key=key)
 
 
-def _scenes(task: tuple[Recording, str, Sequence[int]]) -> None:
+def _record_scenes(task: tuple[Recording, str, Sequence[int]]) -> None:
     """Record scenes of a town, which share a street."""
     recording, town, numbers = task
     for number in numbers:
-        _scene(recording, town, number)
+        _record_scene(recording, town, number)
 
 
 def _name(town: str, number: int) -> str:
     return f"scene-{town.lower()}-{number:03d}"
 
 
-def _scene(recording: Recording, town: str, number: int) -> None:
+def _record_scene(recording: Recording, town: str, number: int) -> None:
     """Record one scene into its part; a finished part is left alone."""
     name = _name(town, number)
     parts = recording.parts
-    if parts.finished(name):
+    if parts.is_finished(name):
         return
     folder = parts.begin(name)
-    quiet_warp()
+    start_warp_quietly()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph = load_town(town)
@@ -220,12 +220,12 @@ def _scene(recording: Recording, town: str, number: int) -> None:
     # The last sweep ends 0.1 s after the last step, and interpolation needs one more.
     seconds, streets = recording.seconds + 0.2, recording.streets
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
-    trace = drive(episode, graph)
+    trace = drive_with_autopilot(episode, graph)
     population = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
     weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
     samples: list[dict[str, Any]] = []
-    files = _Files(folder, recording.quality)
+    files = _PartWriter(folder, recording.quality)
     sweep_spacing = max(1, KEY // (recording.sweeps + 1))
     steps = [
         step
@@ -241,24 +241,30 @@ def _scene(recording: Recording, town: str, number: int) -> None:
         moments = [
             _Moment.of(step, population, trace, cameras, weather, key) for step in steps[start : start + steps_per_call]
         ]
-        for moment, shares in _look(scene, moments, files, number, batched=recording.device != "cpu"):
+        for moment, shares in _render_moments(scene, moments, files, number, batched=recording.device != "cpu"):
             sweep_end = moment.now
             ego = ego_at(trace, sweep_end)
             surrounding = population.at(sweep_end, ego[:2, 3], RENDER_RANGE)
             points, _ = sweep(
                 scene, HDL32E, ego, [placed.scene_object for placed in surrounding], key=("lidar", *key, moment.step)
             )
-            files.cloud(points, sweep=moment.step, moment=moment_of(number, sweep_end), on_key=moment.on_key, ego=ego)
-            if moment.on_key:
+            files.write_sweep(
+                points,
+                sweep=moment.step,
+                moment=moment_timestamp(number, sweep_end),
+                on_key=moment.is_key_frame,
+                ego=ego,
+            )
+            if moment.is_key_frame:
                 boxes = _annotate([placed for placed in surrounding if placed.body.kind], ego, points, shares)
-                samples.append({"time": moment_of(number, sweep_end), "sweep": moment.step, "boxes": boxes})
+                samples.append({"time": moment_timestamp(number, sweep_end), "sweep": moment.step, "boxes": boxes})
     part_page = {
         "name": name,
         "town": town,
         "drive": episode.key,
         "samples": samples,
         "frames": files.rows,
-        "weather": weather_words(weather),
+        "weather": describe_weather(weather),
         "sensors": _sensors(cameras),
     }
     parts.finish(name, part_page)
@@ -295,7 +301,7 @@ class _Moment:
     egos: list[F64]
 
     @property
-    def on_key(self) -> bool:
+    def is_key_frame(self) -> bool:
         """True for a key frame."""
         return self.step % KEY == 0
 
@@ -326,8 +332,8 @@ class _Moment:
         return _Moment(step, sweep_end, views, times, egos)
 
 
-def _look(
-    stage: RenderScene, moments: Sequence[_Moment], files: _Files, number: int, *, batched: bool
+def _render_moments(
+    stage: RenderScene, moments: Sequence[_Moment], files: _PartWriter, number: int, *, batched: bool
 ) -> Iterator[tuple[_Moment, dict[int, float]]]:
     """Render and write the pictures of some moments, all of them in one call or one by one.
 
@@ -342,30 +348,30 @@ def _look(
         rendering = render(stage, [moment.views[camera_index] for moment, camera_index in batch], linear=False)
         for view_index, (moment, camera_index) in enumerate(batch):
             view = moment.views[camera_index]
-            if moment.on_key:
+            if moment.is_key_frame:
                 shares = largest_shares[
                     next(moment_index for moment_index, candidate in enumerate(moments) if candidate is moment)
                 ]
                 for tag, share in visible_share(stage, view, rendering, view_index).items():
                     shares[tag] = max(shares.get(tag, 0.0), share)
-            files.picture(
+            files.write_image(
                 view.camera,
                 rendering.image[view_index],
                 rendering.depth[view_index],
                 sweep=moment.step,
-                moment=moment_of(number, moment.times[camera_index]),
-                on_key=moment.on_key,
+                moment=moment_timestamp(number, moment.times[camera_index]),
+                on_key=moment.is_key_frame,
                 ego=moment.egos[camera_index],
             )
     yield from zip(moments, largest_shares, strict=True)
 
 
-def moment_of(sweep_number: int, time: float) -> int:
+def moment_timestamp(sweep_number: int, time: float) -> int:
     """Return the time stamp in us of a moment of scene `sweep_number`."""
     return START + sweep_number * 100_000_000 + round(time * 1e6)
 
 
-def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
+def drive_with_autopilot(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
     """Drive an episode with the Autopilot."""
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
@@ -375,14 +381,14 @@ def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
 
 
 @dataclass(slots=True)
-class _Files:
+class _PartWriter:
     """Files of a scene's part, and the rows that describe them."""
 
     folder: Path
     quality: int
     rows: list[dict[str, Any]] = field(default_factory=list)
 
-    def picture(
+    def write_image(
         self, camera: Camera, image: U8, depth: Any, *, sweep: int, moment: int, on_key: bool, ego: F64
     ) -> None:
         """Write one image and its depth map."""
@@ -399,7 +405,7 @@ class _Files:
             ego=ego.tolist(),
         )
 
-    def cloud(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
+    def write_sweep(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
         """Write one sweep."""
         self._write(
             f"LIDAR_TOP_{moment}.pcd.bin",
@@ -490,13 +496,13 @@ def record_nuscenes(
         for first_scene in range(0, recording.scenes, scenes_per_task)
     ]
     if (out / recording.version / "splits.json").is_file():  # written last
-        if not recording.parts.claimed:
+        if not recording.parts.is_claimed:
             raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
         recording.parts.claim()
         return out
     pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
-    with recording.parts.held("ssad record"):
-        run_all(pool, _scenes, tasks, timeout_s=TIME_LIMIT, progress=progress)
+    with recording.parts.lock("ssad record"):
+        run_all(pool, _record_scenes, tasks, timeout_s=TIME_LIMIT, progress=progress)
         _merge(recording, [_name(town, number) for _, town, numbers in tasks for number in numbers])
     return out
 

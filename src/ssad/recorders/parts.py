@@ -38,7 +38,7 @@ class PartsFolder:
     request: Mapping[str, Any]
 
     @property
-    def claimed(self) -> bool:
+    def is_claimed(self) -> bool:
         """True if the folder holds a request."""
         return (self.out / FOLDER / REQUEST).is_file()
 
@@ -51,7 +51,7 @@ class PartsFolder:
         claim(self.out / FOLDER / REQUEST, self.request, f"{self.out}: holds another recording; choose another folder")
 
     @contextlib.contextmanager
-    def held(self, command: str) -> Iterator[None]:
+    def lock(self, command: str) -> Iterator[None]:
         """Hold the claimed folder for this process.
 
         Args:
@@ -64,7 +64,7 @@ class PartsFolder:
             self.claim()
             yield
 
-    def finished(self, name: str) -> bool:
+    def is_finished(self, name: str) -> bool:
         """Return whether a part has its page."""
         return (self.part(name) / PAGE).is_file()
 
@@ -118,10 +118,10 @@ def claim(path: Path, request: Mapping[str, Any], refusal: str) -> None:
         content = safeio.read_json(path)
     except FormatError:
         raise StoreError(refusal) from None
-    if not same_request(content, request):
+    if not is_same_request(content, request):
         raise StoreError(refusal)
 
 
-def same_request(content: Any, request: Mapping[str, Any]) -> bool:
+def is_same_request(content: Any, request: Mapping[str, Any]) -> bool:
     """Return whether the content of a file is a request, which may hold tuples in place of lists."""
     return bool(content == safeio.parse_json(safeio.dump_json(dict(request))))

@@ -21,11 +21,11 @@ import cv2
 import numpy as np
 
 from ssad.core import safeio
-from ssad.core.boxes import UNIT_CORNERS, hulls
+from ssad.core.boxes import UNIT_CORNERS, image_rectangles
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest, generator
@@ -33,25 +33,25 @@ from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import drive_street, make_drive
-from ssad.recorders.nuscenes import draw_weather, drive
-from ssad.recorders.parts import TIME_LIMIT, same_request
+from ssad.recorders.nuscenes import draw_weather, drive_with_autopilot
+from ssad.recorders.parts import TIME_LIMIT, is_same_request
 from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, TargetRecording
 from ssad.recorders.viewpoints import (
     AIM,
     Place,
     Viewpoint,
-    follow,
-    free_sight,
+    following_viewpoints,
+    has_free_sight,
     has_room,
     near_share,
-    orbit,
-    orbit_sign,
-    turn_of,
+    orbiting_viewpoints,
+    shuffled_cells,
+    sign_viewpoints,
     weather_name,
 )
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, PLAIN_CLASSES, class_of
-from ssad.rendering.camera.labels import label_picture
+from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.lamps import NOSE, own_lamps
 from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
@@ -82,50 +82,56 @@ MAX_NEAR_SHARE: Final = 0.2  # largest share of the picture that something right
 
 
 @dataclass(frozen=True, slots=True)
-class _StageSet:
+class _TargetDrive:
     """A drive to take images of.
 
     Attributes:
-        clips: Settings of the recording.
+        recording: Settings of the recording.
         key: Key of all random draws.
         trace: The drive.
-        cast: Bodies of the drive.
-        stage: Street and bodies, ready to be rendered.
+        population: Bodies of the drive.
+        scene: Street and bodies, ready to be rendered.
         targets: Bodies that play the target in turn.
         places: Possible places of a standing target.
     """
 
-    clips: TargetRecording
+    recording: TargetRecording
     key: tuple[object, ...]
     trace: EpisodeTrace
-    cast: SceneObjects
-    stage: RenderScene
+    population: SceneObjects
+    scene: RenderScene
     targets: tuple[ObjectBody, ...]
     places: tuple[Place, ...] = ()
 
 
-def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _StageSet:
+def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
     graph = load_town(town)
-    street = drive_street(graph, clips.streets, key=("clips", *key))
-    trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
-    population = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
+    street = drive_street(graph, recording.streets, key=("clips", *key))
+    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    population = place_objects(trace, graph, street, key=key, many_signs=recording.streets == "any")
     places: tuple[Place, ...] = ()
-    if isinstance(clips.target, TargetSign):
-        targets: tuple[ObjectBody, ...] = (_sign(population, clips.target),)
+    if isinstance(recording.target, TargetSign):
+        targets: tuple[ObjectBody, ...] = (_sign(population, recording.target),)
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
         free_ground = GroundOccupancy(street)
         occupy_standing(population, free_ground)
         free_spots = free_places(graph, route_points, free_ground, key=("target", *key))
         places = tuple((*place, plate_height(targets[0])) for place in free_spots)
-    elif clips.target is not None:
-        targets = (_body_of_target(population, clips.target),)
+    elif recording.target is not None:
+        targets = (_body_of_target(population, recording.target),)
     else:
-        target_count = TARGETS if clips.mode == "orbit" else 1
+        target_count = TARGETS if recording.mode == "orbit" else 1
         targets = tuple(
             _draw_target(population, generator("clips target", *key, index)) for index in range(target_count)
         )
-    return _StageSet(
-        clips, key, trace, population, RenderScene(street, population.meshes, device=clips.device), targets, places
+    return _TargetDrive(
+        recording,
+        key,
+        trace,
+        population,
+        RenderScene(street, population.meshes, device=recording.device),
+        targets,
+        places,
     )
 
 
@@ -166,16 +172,16 @@ def batch_size(device: str) -> int:
     return 1 if device == "cpu" else 32
 
 
-def _rounds(
-    stage_set: _StageSet, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
+def _viewpoint_rounds(
+    stage_set: _TargetDrive, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
-    recording, key = stage_set.clips, stage_set.key
+    recording, key = stage_set.recording, stage_set.key
     rng = generator("clips shots", *key)
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
         remaining = iter(
-            follow(
+            following_viewpoints(
                 stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), rng=rng
             )
         )
@@ -185,7 +191,7 @@ def _rounds(
     if isinstance(recording.target, TargetSign) and not stage_set.places:
         return
     grid = list(product(recording.distances, recording.azimuths, recording.elevations, recording.weathers or ("",)))
-    cell_indices = turn_of(slots, len(grid), key=(recording.seed, town))
+    cell_indices = shuffled_cells(slots, len(grid), key=(recording.seed, town))
     if attempt >= 3:
         # Some cells have no free view in a town; random cells keep the recording from stalling.
         cell_indices = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
@@ -198,12 +204,12 @@ def _rounds(
             weather = draw_weather(("clips", *key, turn, index), weather_kind)
             if isinstance(recording.target, TargetSign):
                 seconds = (len(stage_set.trace.x) - 1) * stage_set.trace.dt
-                views = orbit_sign(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
+                views = sign_viewpoints(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
             else:
-                views = orbit(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
+                views = orbiting_viewpoints(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
             proposals += [(index, viewpoint) for viewpoint in islice(views, attempts)]
-        sight_free = free_sight(
-            stage_set.stage,
+        sight_free = has_free_sight(
+            stage_set.scene,
             [viewpoint for _, viewpoint in proposals],
             batch=batch_size(recording.device),
             height=height,
@@ -223,10 +229,10 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     """
     recording, town, number, count, name = task
     parts = recording.parts
-    if parts.finished(name):
+    if parts.is_finished(name):
         return name
     parts.begin(name)
-    quiet_warp()
+    start_warp_quietly()
     cv2.setNumThreads(1)
     rows: dict[int, dict[str, Any]] = {}
     skipped: Counter[str] = Counter()
@@ -237,7 +243,7 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
 
     for attempt in range(MAX_DRIVES):
         stage_set = _prepare(recording, town, (recording.seed, recording.mode, town, number, attempt))
-        for viewpoints in _rounds(stage_set, town, slots, attempt, missing):
+        for viewpoints in _viewpoint_rounds(stage_set, town, slots, attempt, missing):
             for image_index, row, image in _accept_views(stage_set, viewpoints, skipped):
                 file = f"{name}-{image_index:03d}.jpg"
                 safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, recording.quality, "420"))
@@ -264,15 +270,15 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
 
 
 def _accept_views(
-    stage_set: _StageSet, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
+    stage_set: _TargetDrive, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
-    recording = stage_set.clips
+    recording = stage_set.recording
     camera = _camera(recording.size)
     candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for slot, viewpoint in shots:
         target = stage_set.targets[slot % len(stage_set.targets)]
-        surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
         if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
@@ -281,9 +287,9 @@ def _accept_views(
         candidates.append((slot, viewpoint, view, surrounding))
     batch = batch_size(recording.device)
     for start in range(0, len(candidates), batch):
-        rendering = render(stage_set.stage, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
+        rendering = render(stage_set.scene, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
         for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + batch]):
-            objects, reject_reason = _annotate(stage_set.stage, view, rendering, index, surrounding)
+            objects, reject_reason = _annotate(stage_set.scene, view, rendering, index, surrounding)
             if reject_reason:
                 skipped[reject_reason] += 1
                 continue
@@ -301,7 +307,7 @@ def _accept_views(
                 "target_size": [round(extent, 3) for extent in target.size],
                 "objects": objects,
             }
-            yield slot, row | viewpoint.about, rendering.image[index]
+            yield slot, row | viewpoint.description, rendering.image[index]
 
 
 def label_of(kind: str) -> int | None:
@@ -311,7 +317,7 @@ def label_of(kind: str) -> int | None:
     return CLASSES.index(class_of(kind)) if kind in BODY_CATEGORIES else None
 
 
-def faces(sign: F64, viewer: F64) -> bool:
+def is_facing(sign: F64, viewer: F64) -> bool:
     """Return whether the front of a sign of pose [4, 4] can be read from a position [3]: not from behind or aside."""
     forward, left, _ = sign[:3, :3].T @ (viewer - sign[:3, 3])
     return bool(abs(np.degrees(np.arctan2(left, forward))) < BEHIND)
@@ -323,13 +329,13 @@ def _camera(size: int) -> Camera:
 
 
 def _view(
-    stage_set: _StageSet, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
+    stage_set: _TargetDrive, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
 ) -> View:
     """View `n` of a part: the target first, then who else is there."""
     target = stage_set.targets[n % len(stage_set.targets)]
     target_object = SceneObject(target.meshes[0], viewpoint.target, target.paint, TARGET)
     noise_seed = int(digest("clips noise", *stage_set.key, n)[:7], 16)
-    lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.clips.mode == "drive" else ()
+    lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.recording.mode == "drive" else ()
     focus_point = float(viewpoint.target[0, 3]), float(viewpoint.target[1, 3])
     other_parts = (SceneObject(mesh, viewpoint.target, target.paint) for mesh in target.meshes[1:])
     scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects))
@@ -344,16 +350,16 @@ def _follower(viewpoint: Viewpoint) -> F64:
 
 
 def _annotate(
-    stage: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
+    scene: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
     """Return the annotation of an image, and the reason why the image is of no use ("" if it is of use)."""
-    labels = label_picture(stage, view, picture, index)
+    labels = label_image(scene, view, picture, index)
     placed_by_tag = {placed.body.tag: placed for placed in nearby_objects}
     is_target = labels.tag == TARGET
     extents = labels.box[:, 2:] - labels.box[:, :2]
     if not is_target.any() or labels.share[is_target][0] < MIN_VISIBLE_SHARE:
         return [], "hidden"
-    if labels.inside[is_target][0] < MIN_VISIBLE_SHARE or extents[is_target].min() < SMALL:
+    if labels.image_share[is_target][0] < MIN_VISIBLE_SHARE or extents[is_target].min() < SMALL:
         return [], "cut or small"
     target_distance = float(np.linalg.norm(placed_by_tag[TARGET].pose[:3, 3] - view.pose[:3, 3]))
     # A wall or post right before the camera leaves too little of the street to see.
@@ -370,10 +376,10 @@ def _annotate(
         if label is not None:
             centre_height = placed_object.body.size[2] / 2
             if placed_object.body.kind in PLAIN_CLASSES:
-                is_crowd[row] |= not faces(placed_object.pose, view.pose[:3, 3])
+                is_crowd[row] |= not is_facing(placed_object.pose, view.pose[:3, 3])
                 centre_height = plate_height(placed_object.body)
             middle = placed_object.pose[:3, 3] + [0.0, 0.0, centre_height]
-            x1, y1, x2, y2 = _hull(view, placed_object.pose, placed_object.body.size).tolist()
+            x1, y1, x2, y2 = _image_rectangle(view, placed_object.pose, placed_object.body.size).tolist()
             objects.append(
                 {
                     "label": label,
@@ -389,18 +395,18 @@ def _annotate(
     return objects, ""
 
 
-def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
+def _image_rectangle(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
     """Return x1, y1, x2, y2 (px) around the whole 3D box of a body, visible or not."""
     # The pose of a body is that of the middle of its base.
     corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
     body_to_camera = np.linalg.inv(view.pose) @ pose
     camera_corners, camera = corners @ body_to_camera[:3, :3].T + body_to_camera[:3, 3], view.camera
-    box = hulls(camera_corners[None], camera.intrinsic, (camera.width, camera.height))[0]
+    box = image_rectangles(camera_corners[None], camera.intrinsic, (camera.width, camera.height))[0]
     return np.asarray(np.round(box, 2))
 
 
-def record_clips(
-    clips: TargetRecording,
+def record_target_images(
+    recording: TargetRecording,
     *,
     workers: int | None = None,
     ray: str | None = None,
@@ -411,7 +417,7 @@ def record_clips(
     Each file's `info` says what was recorded, how many objects there are of each class, and how many pictures were
     taken elsewhere instead, and why. StoreError, ConfigError.
     """
-    return record_all([clips], workers=workers, ray=ray, progress=progress)[0]
+    return record_all([recording], workers=workers, ray=ray, progress=progress)[0]
 
 
 def record_all(
@@ -421,18 +427,18 @@ def record_all(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Path]:
-    """Record several recordings, as `record_clips` does, with all their parts side by side.
+    """Record several recordings, as `record_target_images` does, with all their parts side by side.
 
     Returns:
         Their folders.
 
     Raises:
-        StoreError: See `record_clips`.
-        ConfigError: See `record_clips`.
+        StoreError: See `record_target_images`.
+        ConfigError: See `record_target_images`.
     """
     tasks: list[list[tuple[TargetRecording, str, int, int, str]]] = []
     for recording in recordings:
-        _check_other(recording)
+        _check_same_recording(recording)
         tasks.append(
             [
                 (recording, town, number, min(EACH, count - start), f"{recording.mode}-{town.lower()}-{number:03d}")
@@ -443,7 +449,7 @@ def record_all(
     all_tasks = [task for recording_tasks in tasks for task in recording_tasks]
     with ExitStack() as locks:
         for recording in recordings:
-            locks.enter_context(recording.parts.held("ssad record"))
+            locks.enter_context(recording.parts.lock("ssad record"))
             safeio.remove_unfinished(recording.out / "images")
         pool = open_pool(len(all_tasks), workers=workers, ray=ray, device=recordings[0].device)
         run_all(pool, _part, all_tasks, timeout_s=TIME_LIMIT, progress=progress)
@@ -452,33 +458,33 @@ def record_all(
     return [recording.out for recording in recordings]
 
 
-def _check_other(clips: TargetRecording) -> None:
+def _check_same_recording(recording: TargetRecording) -> None:
     """StoreError: the folder holds another recording."""
-    annotations_file = clips.out / "annotations" / "all.json"
-    if annotations_file.is_file() and not clips.parts.claimed:
+    annotations_file = recording.out / "annotations" / "all.json"
+    if annotations_file.is_file() and not recording.parts.is_claimed:
         data = safeio.read_json(annotations_file)
         info = data.get("info") if isinstance(data, dict) else None
-        if not isinstance(info, dict) or not same_request(info.get("recording"), clips.identity()):
-            raise StoreError(f"{clips.out}: holds another recording; choose another folder")
+        if not isinstance(info, dict) or not is_same_request(info.get("recording"), recording.identity()):
+            raise StoreError(f"{recording.out}: holds another recording; choose another folder")
 
 
-def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, str, int, int, str]]) -> None:
+def _write_pages(recording: TargetRecording, tasks: Sequence[tuple[TargetRecording, str, int, int, str]]) -> None:
     """annotations/{train,test,all}.json of parts that are all there."""
     splits = {
-        "train": [entry_task for entry_task in tasks if entry_task[1] not in clips.held_out],
-        "test": [entry_task for entry_task in tasks if entry_task[1] in clips.held_out],
+        "train": [entry_task for entry_task in tasks if entry_task[1] not in recording.held_out],
+        "test": [entry_task for entry_task in tasks if entry_task[1] in recording.held_out],
         "all": tasks,
     }
     for split, split_tasks in splits.items():
         rows: list[dict[str, Any]] = []
         reject_counts: Counter[str] = Counter()
         for task in split_tasks:
-            part_page = clips.parts.page(task[4])
+            part_page = recording.parts.page(task[4])
             rows += part_page["images"]
             reject_counts.update(part_page["skipped"])
         counts = Counter(CLASSES[entry["label"]] for row in rows for entry in row["objects"] if not entry["crowd"])
         split_info = {
-            "recording": clips.identity(),
+            "recording": recording.identity(),
             "split": split,
             "towns": sorted({entry_task[1] for entry_task in split_tasks}),
             "images": len(rows),
@@ -487,11 +493,11 @@ def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, 
             "skipped": reject_counts,
         }
         page = safeio.dump_json(coco_data(CLASSES, rows, split_info)) + "\n"
-        safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
+        safeio.write_atomic(recording.out / "annotations" / f"{split}.json", page)
 
 
 @dataclass(frozen=True, slots=True)
-class ClipView:
+class RecordedView:
     """A recorded picture and what it shows, ready to be rendered again.
 
     Attributes:
@@ -509,7 +515,7 @@ class ClipView:
     view: View
     objects: tuple[Mapping[str, Any], ...]
 
-    def wearing(self, *edits: TextureLayer | TextureDecal) -> View:
+    def with_layers(self, *edits: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
         target, *other_objects = self.view.objects
         layers = tuple(layer for layer in edits if isinstance(layer, TextureLayer))
@@ -523,7 +529,7 @@ class ClipView:
 Row = Mapping[str, Any]
 
 
-def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
+def image_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
     """Return the images of a recording in order, each with its annotations.
 
     Args:
@@ -557,7 +563,7 @@ def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
         raise _unknown(path, error) from None
 
 
-def clip_views(
+def recorded_views(
     folder: Path,
     *,
     split: str = "all",
@@ -565,13 +571,13 @@ def clip_views(
     selected_keys: Collection[str] | None = None,
     hour: Callable[[SceneWeather, float], SceneWeather] = lambda weather, heading: weather,
     stages: dict[Any, Any] | None = None,
-) -> Iterator[ClipView]:
+) -> Iterator[RecordedView]:
     """The pictures of a recording with their scenes, in order.
 
     Rendering a view gives the recorded picture (before JPEG) again. Pictures of one drive share a scene.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         split: train, test or all.
         device: Where to render.
         selected_keys: Names of the files that are wanted; None for all.
@@ -582,10 +588,10 @@ def clip_views(
         FormatError: No recording of this version.
     """
     path = folder / "annotations" / f"{split}.json"
-    rows = clip_rows(folder, split)
+    rows = image_rows(folder, split)
     try:
-        recording = _clips_of(recording_of(folder, split), folder, device)
-        prepared_drives: dict[tuple[object, ...], _StageSet] = {} if stages is None else stages
+        recording = _recording_from_description(recording_of(folder, split), folder, device)
+        prepared_drives: dict[tuple[object, ...], _TargetDrive] = {} if stages is None else stages
         for row, objects in rows:
             if selected_keys is not None and row["file_name"] not in selected_keys:
                 continue
@@ -602,9 +608,9 @@ def clip_views(
             target_pose = np.array(row["target_pose"])
             weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
-            surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+            surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
             view = _view(stage_set, row["slot"], viewpoint, surrounding, _camera(recording.size))
-            yield ClipView(row["file_name"], row, stage_set.stage, view, objects)
+            yield RecordedView(row["file_name"], row, stage_set.scene, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
@@ -614,15 +620,17 @@ def _unknown(path: Path, error: Exception) -> FormatError:
     return FormatError(f"{path}: not the clips of this version {error_text}; record them again")
 
 
-def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
+def _recording_from_description(description: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
     """The recording that `TargetRecording.identity` describes."""
     settings: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in about.items() if name != "clips"
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in description.items()
+        if name != "clips"
     }
-    settings["images"] = tuple((town, count) for town, count in about["images"])
-    if about["target"] is not None:
-        size = about["target"]["size"]
-        target_settings = {name: value for name, value in about["target"].items() if name != "kind"}
-        target_class: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
+    settings["images"] = tuple((town, count) for town, count in description["images"])
+    if description["target"] is not None:
+        size = description["target"]["size"]
+        target_settings = {name: value for name, value in description["target"].items() if name != "kind"}
+        target_class: Any = STANDING[description["target"]["kind"]] if "kind" in description["target"] else TargetCar
         settings["target"] = target_class(**target_settings | {"size": None if size is None else tuple(size)})
-    return TargetRecording(folder, **settings | {"mode": about["clips"], "device": device})
+    return TargetRecording(folder, **settings | {"mode": description["clips"], "device": device})

@@ -40,7 +40,7 @@ class Viewpoint:
         camera: Pose [4, 4], x right, y down, z forward.
         target: Pose [4, 4].
         weather: Weather and hour.
-        about: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
+        description: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
             degrees.
     """
 
@@ -48,7 +48,7 @@ class Viewpoint:
     camera: F64
     target: F64
     weather: SceneWeather
-    about: dict[str, Any]
+    description: dict[str, Any]
 
 
 def look_at(position: F64, point: F64) -> F64:
@@ -87,7 +87,7 @@ def weather_name(weather: SceneWeather) -> str:
     return "overcast" if weather.clouds >= 0.85 else "day"
 
 
-def follow(
+def following_viewpoints(
     trace: EpisodeTrace, weather: SceneWeather, *, behind: float, height: float, count: int, rng: np.random.Generator
 ) -> list[Viewpoint]:
     """Every shot of a drive from `behind` m of way behind the driving target, where the target was then, at `height`.
@@ -113,7 +113,7 @@ def follow(
     return viewpoints
 
 
-def orbit(
+def orbiting_viewpoints(
     trace: EpisodeTrace, weather: SceneWeather, cell: tuple[float, float, float], rng: np.random.Generator
 ) -> Iterator[Viewpoint]:
     """Without end: shots of one cell (distance m, azimuth and elevation in degrees) at random moments of a drive.
@@ -136,7 +136,7 @@ def orbit(
         yield Viewpoint(time, look_at(camera_position, aim_point), target, weather, annotation)
 
 
-def orbit_sign(
+def sign_viewpoints(
     places: Sequence[Place],
     seconds: float,
     weather: SceneWeather,
@@ -177,7 +177,7 @@ def orbit_sign(
         yield Viewpoint(time, look_at(camera_position, middle + aim_offset), target, weather, annotation)
 
 
-def turn_of(numbers: range, count: int, *, key: tuple[object, ...]) -> list[int]:
+def shuffled_cells(numbers: range, count: int, *, key: tuple[object, ...]) -> list[int]:
     """Return the cell of each image by number: all `count` cells in random order before any is repeated."""
     permutations = [
         generator("clips cells", *key, round_index).permutation(count)
@@ -209,7 +209,7 @@ def has_room(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[
     return bool((obb_distance(target_box, boxes) > 0.1).all() and (camera_distance[is_tall] > 0.6).all())
 
 
-def free_sight(stage: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
+def has_free_sight(scene: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
     """Return whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
@@ -225,7 +225,7 @@ def free_sight(stage: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: in
             views.append(
                 View(camera, look_at(target_point, camera_position), (), SceneWeather(fog=6.0 / (distances[-1] + 20.0)))
             )
-        depth_maps = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
+        depth_maps = render(scene, views, scale=1, quality=PLAIN, linear=False).depth
         is_free += [
             bool((depth_map >= distance + 0.3).all()) for depth_map, distance in zip(depth_maps, distances, strict=True)
         ]

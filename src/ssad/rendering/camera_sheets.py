@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from ssad.core.frames import FORWARD, Camera
-from ssad.core.images import captioned, save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.images import add_caption, save_picture
+from ssad.core.machine import start_warp_quietly
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, LaneType
@@ -75,7 +75,7 @@ def class_sheet(width: int = 240) -> U8:
             )
         )
     rendering = render(scene, views, scale=3)
-    panels = [captioned(image, caption, width) for image, (caption, _) in zip(rendering.image, captions, strict=True)]
+    panels = [add_caption(image, caption, width) for image, (caption, _) in zip(rendering.image, captions, strict=True)]
     # White panels complete the last row of six.
     while len(panels) % 6:
         panels.append(np.full_like(panels[0], 255))
@@ -135,7 +135,7 @@ def weather_sheet(width: int = 480) -> U8:
         for weather in WEATHERS.values()
     ]
     images = [render(scene, [view]).image[0] for view in views]
-    panels = [captioned(image, name, width) for image, name in zip(images, WEATHERS, strict=True)]
+    panels = [add_caption(image, name, width) for image, name in zip(images, WEATHERS, strict=True)]
     return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
@@ -147,7 +147,7 @@ def rig_sheet(width: int = 480) -> U8:
         render(scene, [View(camera, ego @ camera.to_ego, scene_objects, SceneWeather(0.8, 2.2, 0.3))]).image[0]
         for camera in cameras
     ]
-    panels = [captioned(image, camera.channel, width) for image, camera in zip(images, cameras, strict=True)]
+    panels = [add_caption(image, camera.channel, width) for image, camera in zip(images, cameras, strict=True)]
     return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
@@ -160,7 +160,7 @@ def write_gallery(folder: Path) -> dict[str, str]:
     Raises:
         StoreError: A file cannot be written.
     """
-    quiet_warp()
+    start_warp_quietly()
     cv2.setNumThreads(1)
     sheets = {
         "camera-classes.jpg": ("The ten nuScenes classes as the camera knows them.", class_sheet),

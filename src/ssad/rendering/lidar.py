@@ -78,14 +78,14 @@ class _RayScene:
     The faces of all are numbered consecutively; `material` holds the material of each.
     """
 
-    def __init__(self, stage: RenderScene) -> None:
-        self.device = stage.device
+    def __init__(self, scene: RenderScene) -> None:
+        self.device = scene.device
         self.street: Any = None
         self.meshes: dict[int, tuple[Any, int, F64, float]] = {}
         self.material: list[I32] = []
         self.total = 0
         self._on_device: Any = None
-        surfaces = stage.surfaces.numpy()
+        surfaces = scene.surfaces.numpy()
         colours = np.asarray(surfaces["colour"], np.float64)
         luminance = colours @ LUMINANCE
         echo = np.where(surfaces["paint"] == 1, -1.0, luminance).astype(np.float32)
@@ -96,34 +96,34 @@ class _RayScene:
             & (luminance < 0.2)
             & (surfaces["emission"] == 0.0)
         )
-        self.echo = wp.array(echo, dtype=float, device=stage.device)
-        self.clear = wp.array((is_glass & (surfaces["paint"] == 0)).astype(np.int32), dtype=int, device=stage.device)
-        if stage.street is not None:
-            street = stage.street
+        self.echo = wp.array(echo, dtype=float, device=scene.device)
+        self.clear = wp.array((is_glass & (surfaces["paint"] == 0)).astype(np.int32), dtype=int, device=scene.device)
+        if scene.street is not None:
+            street = scene.street
             street_faces = np.asarray(street.order[street.offset[0, 0] : street.offset[0, -1]], np.int32)
-            self.street = self._mesh(stage, street_faces)[0]
+            self.street = self._mesh(scene, street_faces)[0]
 
-    def _mesh(self, stage: RenderScene, listed: I32) -> tuple[Any, int, F64]:
+    def _mesh(self, scene: RenderScene, face_list: I32) -> tuple[Any, int, F64]:
         """A mesh of these faces, the number of its first face, and its vertices; None without faces."""
-        faces = stage.faces.numpy()[listed]
+        faces = scene.faces.numpy()[face_list]
         vertex_indices, indices = np.unique(faces, return_inverse=True)
-        points = stage.vertices.numpy()[vertex_indices]
+        points = scene.vertices.numpy()[vertex_indices]
         first_face = self.total
-        self.total += len(listed)
-        self.material.append(stage.material.numpy()[listed])
+        self.total += len(face_list)
+        self.material.append(scene.material.numpy()[face_list])
         self._on_device = None
-        if not len(listed):
+        if not len(face_list):
             return None, first_face, points
-        points = wp.array(points, dtype=wp.vec3, device=stage.device)
-        indices = wp.array(indices.reshape(-1).astype(np.int32), dtype=int, device=stage.device)
+        points = wp.array(points, dtype=wp.vec3, device=scene.device)
+        indices = wp.array(indices.reshape(-1).astype(np.int32), dtype=int, device=scene.device)
         return wp.Mesh(points=points, indices=indices), first_face, points.numpy()
 
-    def body(self, stage: RenderScene, mesh: int) -> tuple[Any, int, F64, float]:
+    def body(self, scene: RenderScene, mesh: int) -> tuple[Any, int, F64, float]:
         """Return mesh, number of its first face, middle [3] and radius of its bounding sphere in its own frame."""
         if mesh not in self.meshes:
-            first_entry = stage.first[mesh]
+            first_entry = scene.first[mesh]
             ray_mesh, first_face, points = self._mesh(
-                stage, stage.listed.numpy()[first_entry : first_entry + stage.count[mesh]]
+                scene, scene.listed.numpy()[first_entry : first_entry + scene.count[mesh]]
             )
             middle = (points.min(0) + points.max(0)).astype(np.float64) / 2
             # The margin covers the rounding to float32 in the kernel.
@@ -305,13 +305,13 @@ def _velocities(objects: Sequence[SceneObject], previous_objects: Sequence[Scene
 
 
 def _targets(
-    stage: RenderScene, scene: _RayScene, objects: Sequence[SceneObject], eye: F64, velocities: F64
+    rays: RenderScene, scene: _RayScene, objects: Sequence[SceneObject], eye: F64, velocities: F64
 ) -> tuple[Any, tuple[F64, F64]]:
     """Rows of `Target` for things, and their bounding spheres: middle relative to the eye [T, 3], radius [T]."""
     rows: Any = np.zeros(len(objects), kernels.Target.numpy_dtype())  # type: ignore[attr-defined]
     centres, radii = np.zeros((len(objects), 3)), np.zeros(len(objects))
     for index, scene_object in enumerate(objects):
-        mesh, first_face, middle, radius = scene.body(stage, scene_object.mesh)
+        mesh, first_face, middle, radius = scene.body(rays, scene_object.mesh)
         pose = np.asarray(scene_object.pose, np.float64)
         inverse = np.linalg.inv(pose)
         centres[index] = pose[:3, :3] @ middle + pose[:3, 3] - eye

@@ -65,7 +65,7 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class AgentView:
     """View of an agent at a moment.
 
     Attributes:
@@ -134,7 +134,7 @@ class Onboard:
         """Return the six cameras of nuScenes by channel, with images of this width in pixels (16:9)."""
         return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
 
-    def together(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
+    def group_cameras(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
         """Return cameras that are always read together: those of one size are rendered in one call.
 
         Args:
@@ -202,7 +202,7 @@ class Onboard:
         if self.attack is not None:
             town.add_meshes(self.attack.meshes(self.attack.attacked_model(appearance.models, appearance.key)))
 
-    def visible_objects(self, sight: Sight) -> tuple[SceneObject, ...]:
+    def visible_objects(self, sight: AgentView) -> tuple[SceneObject, ...]:
         """The bodies that an agent could see."""
         scene_objects = sight.town.objects(sight.appearance, sight.moment, without=sight.agent)
         if self.attack is None:
@@ -210,7 +210,7 @@ class Onboard:
         (target_key, *_) = self.attack.meshes(self._attacked(sight))
         return self.attack.replace_attacked(scene_objects, sight.town.index(target_key), sight.town.stop_signs)
 
-    def render(self, sights: Sequence[Sight], cameras: Sequence[Camera]) -> Rendering:
+    def render(self, sights: Sequence[AgentView], cameras: Sequence[Camera]) -> Rendering:
         """Render sights in one town, all of one edit (see `edit`), camera by camera; arrays stay on the device."""
         object_cache: dict[int, tuple[SceneObject, ...]] = {}
         views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
@@ -223,15 +223,15 @@ class Onboard:
         )
         return replace(rendering, image=image, tag=tag, depth=depth)
 
-    def edit(self, sight: Sight) -> SceneEdit | None:
+    def edit(self, sight: AgentView) -> SceneEdit | None:
         """Return the edit of an episode, the same for all episodes whose attacked agent is of one model."""
         return None if self.attack is None else self.attack.body(self._attacked(sight))[1]
 
-    def _attacked(self, sight: Sight) -> str:
+    def _attacked(self, sight: AgentView) -> str:
         assert self.attack is not None
         return self.attack.attacked_model(sight.appearance.models, sight.appearance.key)
 
-    def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
+    def agent_views(self, simulator: Simulator, agents: I32) -> list[AgentView]:
         """Return the current views of agents [N, 2] (scene, agent), without those whose episode has ended."""
         state, ended = self._follow(simulator), simulator.ended()
         agent_views, moments = [], {}
@@ -246,12 +246,12 @@ class Onboard:
                     step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal
                 )
             town = self.town(simulator.graphs[simulator.episodes[history.episode].town])
-            agent_views.append(Sight(row, town, history.appearance, moments[scene], agent))
+            agent_views.append(AgentView(row, town, history.appearance, moments[scene], agent))
         return agent_views
 
-    def sights_of_trace(
+    def trace_views(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
-    ) -> list[Sight]:
+    ) -> list[AgentView]:
         """Return the views of an agent at steps of a trace.
 
         Args:
@@ -273,10 +273,10 @@ class Onboard:
         town = self.town(graph)
         appearance = town.appearance_of_trace(trace)
         self._add_episode(town, appearance)
-        return [Sight(row, town, appearance, moments[step], agent) for row, step in enumerate(selected_steps)]
+        return [AgentView(row, town, appearance, moments[step], agent) for row, step in enumerate(selected_steps)]
 
     def view(
-        self, sight: Sight, camera: Camera, object_cache: dict[int, tuple[SceneObject, ...]] | None = None
+        self, sight: AgentView, camera: Camera, object_cache: dict[int, tuple[SceneObject, ...]] | None = None
     ) -> View:
         """Return the view through a camera of the agent; `object_cache` holds gathered objects by `id` of a sight."""
         appearance, moment, agent = sight.appearance, sight.moment, sight.agent
@@ -305,7 +305,7 @@ class Onboard:
 
 @dataclass(slots=True)
 class Rig:
-    """Cameras of one size that are rendered together, see `Onboard.together`.
+    """Cameras of one size that are rendered together, see `Onboard.group_cameras`.
 
     Attributes:
         cameras: The cameras.
@@ -333,14 +333,14 @@ class OnboardCamera:
     def __call__(self, simulator: Simulator, agents: I32) -> Any:
         """Return images [N, 3, H, W] of agents [N, 2] (scene, agent); black if the episode has ended."""
         if self.rig is None:
-            return self._read(self.onboard.sights(simulator, agents), len(agents))
+            return self._read(self.onboard.agent_views(simulator, agents), len(agents))
         state = simulator.state()
         state_arrays = (state.time, state.pose, state.active, state.signal, agents)
         # The first camera that is read renders the whole group; the state tells a new moment from an old one.
         moment = (id(simulator), *(array.tobytes() for array in state_arrays))
         camera_index = next(index for index, camera in enumerate(self.rig.cameras) if camera is self.camera)
         if moment != self.rig.moment or camera_index not in self.rig.read:
-            cameras, agent_views = self.rig.cameras, self.onboard.sights(simulator, agents)
+            cameras, agent_views = self.rig.cameras, self.onboard.agent_views(simulator, agents)
             self.rig.moment = moment
             self.rig.read = dict(enumerate(self._read_all(agent_views, len(agents), cameras)))
         return self.rig.read.pop(camera_index)
@@ -348,24 +348,24 @@ class OnboardCamera:
     def of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
     ) -> U8:
-        """The pictures [T, 3, H, W] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
-        agent_views = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        """The pictures [T, 3, H, W] that an agent was shown; arguments and errors as `Onboard.trace_views`."""
+        agent_views = self.onboard.trace_views(trace, graph, agent=agent, steps=steps)
         images = self._read(agent_views, len(agent_views))
         host_images: U8 = images.cpu().numpy() if self.onboard.resident else images
         return host_images
 
-    def _read(self, sights: Sequence[Sight], count: int) -> Any:
+    def _read(self, sights: Sequence[AgentView], count: int) -> Any:
         """All pictures in as few calls as possible."""
         return self._read_all(sights, count, [self.camera])[0]
 
-    def _read_all(self, sights: Sequence[Sight], count: int, cameras: Sequence[Camera]) -> Any:
+    def _read_all(self, sights: Sequence[AgentView], count: int, cameras: Sequence[Camera]) -> Any:
         """Pictures [C, N, 3, H, W] of cameras of one size; a tensor on the GPU where they stay there."""
         shape = (len(cameras), count, self.camera.height, self.camera.width, 3)
         if self.onboard.resident:
             import torch
 
             gpu_images = torch.zeros(shape, dtype=torch.uint8, device=self.onboard.device)
-            for batch, rendering in self.shots(sights, cameras):
+            for batch, rendering in self.render_batches(sights, cameras):
                 rows = torch.tensor([agent_view.row for agent_view in batch], device=gpu_images.device)
                 wp.synchronize_device(self.onboard.device)  # torch has a stream of its own
                 gpu_images[:, rows] = wp.to_torch(rendering.image).view(len(cameras), len(batch), *shape[2:])
@@ -373,16 +373,16 @@ class OnboardCamera:
                     torch.cuda.synchronize(gpu_images.device)
             return gpu_images.movedim(-1, 2)
         host_images = np.zeros(shape, np.uint8)
-        for batch, rendering in self.shots(sights, cameras):
+        for batch, rendering in self.render_batches(sights, cameras):
             images = rendering.image.numpy()  # type: ignore[attr-defined]
             host_images[:, [agent_view.row for agent_view in batch]] = images.reshape(
                 len(cameras), len(batch), *shape[2:]
             )
         return np.moveaxis(host_images, -1, 2)
 
-    def shots(
-        self, sights: Sequence[Sight], cameras: Sequence[Camera] | None = None
-    ) -> Iterator[tuple[list[Sight], Rendering]]:
+    def render_batches(
+        self, sights: Sequence[AgentView], cameras: Sequence[Camera] | None = None
+    ) -> Iterator[tuple[list[AgentView], Rendering]]:
         """Render in as few calls as possible.
 
         Args:
@@ -395,7 +395,7 @@ class OnboardCamera:
         """
         cameras = [self.camera] if cameras is None else cameras
         # One call renders one scene under one edit.
-        groups: dict[tuple[int, int], list[Sight]] = {}
+        groups: dict[tuple[int, int], list[AgentView]] = {}
         for agent_view in sights:
             groups.setdefault((id(agent_view.town), id(self.onboard.edit(agent_view))), []).append(agent_view)
         views_per_call = max(self.onboard.at_once // len(cameras), 1)
@@ -418,16 +418,16 @@ class OnboardLidar:
 
     def __call__(self, simulator: Simulator, agents: I32) -> F32:
         """Return points [N, P, 5] of agents [N, 2] (scene, agent); none if the episode has ended."""
-        return self._read(self.onboard.sights(simulator, agents), len(agents))
+        return self._read(self.onboard.agent_views(simulator, agents), len(agents))
 
     def of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
     ) -> F32:
-        """The points [T, P, 5] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
-        agent_views = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        """The points [T, P, 5] that an agent was shown; arguments and errors as `Onboard.trace_views`."""
+        agent_views = self.onboard.trace_views(trace, graph, agent=agent, steps=steps)
         return self._read(agent_views, len(agent_views))
 
-    def _read(self, sights: Sequence[Sight], count: int) -> F32:
+    def _read(self, sights: Sequence[AgentView], count: int) -> F32:
         """One turn for each."""
         readings = np.zeros((count, len(self.lidar.beams) * self.lidar.azimuths, 5), np.float32)
         readings[..., 4] = -1.0

@@ -36,7 +36,7 @@ class OnboardRadar:
         """
         detections = np.zeros((len(agents), len(self.rays.beams) * self.rays.azimuths, 4), np.float32)
         state = simulator.state()
-        for agent_view in self.onboard.sights(simulator, agents):
+        for agent_view in self.onboard.agent_views(simulator, agents):
             scene = int(agents[agent_view.row, 0])
             key = ("onboard radar", agent_view.appearance.key, agent_view.moment.step, agent_view.agent)
             points, tags = sweep(

@@ -79,8 +79,10 @@ FEWER = 0.4  # times as many cars, against all else, where streets are "any": a 
 
 def thin_shares(shares: Mapping[str, float], streets: str) -> dict[str, float]:
     """Shares of bodies, of the sum 1; fewer cars for "any" (see `FEWER`)."""
-    found = {body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()}
-    return {body: share / sum(found.values()) for body, share in found.items()}
+    shares_by_kind = {
+        body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()
+    }
+    return {body: share / sum(shares_by_kind.values()) for body, share in shares_by_kind.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +98,8 @@ class ObjectBody:
         meshes: Numbers of its meshes: one, or those of a cycle of `STRIDE` m.
         track: [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it is static.
         active: [T] whether it is present.
-        driven: [T] distance covered so far, m.
-        parked: Whether it is a vehicle without a driver.
+        is_driven: [T] distance covered so far, m.
+        is_parked: Whether it is a vehicle without a driver.
     """
 
     tag: int
@@ -108,8 +110,8 @@ class ObjectBody:
     meshes: tuple[int, ...]
     track: F64
     active: Bool
-    driven: F64
-    parked: bool = False
+    is_driven: F64
+    is_parked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,7 @@ class SceneObjects:
     meshes: LazyMeshes = field(default_factory=LazyMeshes)
     bodies: list[ObjectBody] = field(default_factory=list)
 
-    def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
+    def at(self, time: float, centre: F64, reach: float) -> list[PlacedObject]:
         """Return the bodies within `reach` (m) of a place [2] at a time (s), interpolated between steps."""
         placed = []
         for body in self.bodies:
@@ -199,18 +201,22 @@ class SceneObjects:
                 lower_state[2] + fraction * yaw_change,
                 lower_state[3],
             )
-            if np.hypot(x - around[0], y - around[1]) > reach:
+            if np.hypot(x - centre[0], y - centre[1]) > reach:
                 continue
             speed = (
                 float(np.hypot(upper_state[0] - lower_state[0], upper_state[1] - lower_state[1])) / self.dt
                 if upper_step > lower_step
                 else 0.0
             )
-            walked = float(body.driven[lower_step] + fraction * (body.driven[upper_step] - body.driven[lower_step]))
+            walked = float(
+                body.is_driven[lower_step] + fraction * (body.is_driven[upper_step] - body.is_driven[lower_step])
+            )
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
             placed.append(
-                PlacedObject(body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, lit=not body.parked))
+                PlacedObject(
+                    body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked)
+                )
             )
         return placed
 
@@ -257,7 +263,7 @@ class GroundOccupancy:
         squares: list[list[int]] = np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0).tolist()
         self.occupied_squares = {(x, y) for x, y in squares}
 
-    def footprint(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
+    def is_free(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
         """Return True if a rectangle is free."""
         # 0.45 m is below the side of a square, so that none is skipped.
         along, across = np.meshgrid(
@@ -303,10 +309,10 @@ def place_objects(
         many_signs: See `ssad.rendering.street_signs.street_signs`.
     """
     population = SceneObjects(trace.dt, key, detail)
-    _agents(population, trace)
+    _add_agents(population, trace)
     route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
     free_ground = GroundOccupancy(street)
-    _kerb(
+    _add_parked_vehicles(
         population,
         graph,
         street,
@@ -314,13 +320,13 @@ def place_objects(
         free_ground,
         thin_shares({body_kind: PARKED[body_kind][0] for body_kind in PARKED}, streets),
     )
-    _sidewalks(population, graph, route_points, free_ground, len(trace.x))
+    _add_sidewalk_bodies(population, graph, route_points, free_ground, len(trace.x))
     # Signs come last: they evade whatever stands at their place, and nothing evades them.
-    _signs(population, graph, route_points, free_ground, many=many_signs)
+    _add_signs(population, graph, route_points, free_ground, many=many_signs)
     return population
 
 
-def _agents(population: SceneObjects, trace: EpisodeTrace) -> None:
+def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
     """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
     for agent in range(1, len(trace.models)):
         rng = generator("record body", *population.key, agent)
@@ -336,7 +342,7 @@ def _agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         kind, styles = ACTOR_BODIES[trace.models[agent]]
         style = styles[int(rng.integers(len(styles)))]
         if kind == "bus" and rng.random() < 0.45:
-            _tractor(population, track, active, rng)
+            _add_tractor(population, track, active, rng)
             continue
         if kind == "truck" and rng.random() < 0.3:
             kind, style = "construction", draw_style("construction", generator=rng)
@@ -347,7 +353,7 @@ def _agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         population.add(population.make(kind, style, size, phases=phases), track, active=active)
 
 
-def _tractor(population: SceneObjects, track: F64, active: Bool, random_draws: np.random.Generator) -> None:
+def _add_tractor(population: SceneObjects, track: F64, active: Bool, random_draws: np.random.Generator) -> None:
     """A tractor on the front half of the agent, a trailer that follows its hitch."""
     height = float(random_draws.uniform(3.2, 3.8))
     sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(random_draws.uniform(3.3, 3.9))))
@@ -375,7 +381,7 @@ def _fixed_track(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
     return np.array([[x, y, yaw, z]])
 
 
-def _kerb(  # noqa: PLR0917
+def _add_parked_vehicles(  # noqa: PLR0917
     population: SceneObjects,
     graph: LaneGraph,
     street: Street,
@@ -393,7 +399,7 @@ def _kerb(  # noqa: PLR0917
         sidewalk = int(graph.right[lane])
         if sidewalk < 0 or graph.kind[sidewalk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
             continue
-        if graph.left[lane] >= 0 and graph.divided(int(graph.left[lane])):
+        if graph.left[lane] >= 0 and graph.is_divided(int(graph.left[lane])):
             continue  # nobody parks in a roundabout
         distance = 9.0 + float(rng.uniform(0, 3))
         while distance < float(graph.length[lane]) - 9.0:
@@ -423,17 +429,17 @@ def _kerb(  # noqa: PLR0917
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
         lateral_offset = size[1] / 2 + 0.08 if spot_index >= len(parking_lots) else 0.0
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
-        if not clear.footprint(x, y, yaw, PARKED[body_kind][1], size[1]):
+        if not clear.is_free(x, y, yaw, PARKED[body_kind][1], size[1]):
             continue
         clear.occupy(x, y, yaw, PARKED[body_kind][1], size[1])
         wrong_way_share = 0.5 if spot_index < len(parking_lots) else AGAINST.get(body_kind, 0.0)
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
         population.add(population.make(body_kind, style, size), _fixed_track(x, y, facing, z), parked=True)
         if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
-            _site(population, (x, y, yaw, z), size, prop_rng, clear)
+            _add_building_site(population, (x, y, yaw, z), size, prop_rng, clear)
 
 
-def _site(
+def _add_building_site(
     population: SceneObjects,
     centre: tuple[float, float, float, float],
     size: Size,
@@ -474,7 +480,7 @@ def _site(
     occupancy.occupy(x, y, yaw, size[0] + 6.0, size[1])
 
 
-def _sidewalks(
+def _add_sidewalk_bodies(
     population: SceneObjects, graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, steps: int
 ) -> None:
     """Add the bodies on sidewalks.
@@ -497,7 +503,7 @@ def _sidewalks(
 
     def stand(x: float, y: float, yaw: float) -> None:
         bystander = bystanders[int(rng.integers(len(bystanders)))]
-        if occupancy.footprint(x, y, 0.0, 0.6, 0.6):
+        if occupancy.is_free(x, y, 0.0, 0.6, 0.6):
             population.add(bystander, _fixed_track(x, y, yaw, KERB))
 
     for lane in np.flatnonzero(graph.kind == LaneType.SIDEWALK):
@@ -526,10 +532,10 @@ def _sidewalks(
                 if any(WALKING[index] == "elderly" for index in group):
                     speed *= SLOW
                 make_track = partial(
-                    _walk, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=population.dt
+                    _sidewalk_track, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=population.dt
                 )
                 for index, walker_lateral in zip(group, (lateral, lateral - 0.8 * np.sign(lateral)), strict=False):
-                    track = make_track(aside=walker_lateral)
+                    track = make_track(lateral=walker_lateral)
                     population.add(walkers[index], track)
                     if index in pushed:
                         population.add(
@@ -544,7 +550,7 @@ def _sidewalks(
                 for index in range(int(rng.integers(2, 6))):
                     size = draw_size(kind, "parked", generator=rng)
                     row_x, row_y, _, _ = graph.at(int(lane), min(float(distance) + RACK[kind] * index, length))
-                    if size[0] < width + 0.4 and occupancy.footprint(row_x, row_y, parked_yaw, size[0], size[1]):
+                    if size[0] < width + 0.4 and occupancy.is_free(row_x, row_y, parked_yaw, size[0], size[1]):
                         population.add(
                             population.make(kind, "parked", size),
                             _fixed_track(row_x, row_y, parked_yaw, KERB),
@@ -558,7 +564,7 @@ def _sidewalks(
                     size = draw_size(kind, style, generator=rng)
                     row_offset = (1.6 if kind == "traffic_cone" else 2.8) * index
                     row_x, row_y, object_yaw, _ = graph.at(int(lane), min(float(distance) + row_offset, length))
-                    if occupancy.footprint(row_x, row_y, 0.0, 0.5, 0.5):
+                    if occupancy.is_free(row_x, row_y, 0.0, 0.5, 0.5):
                         object_yaw += (np.pi / 2 if kind == "barrier" and in_one_row else 0.0) + float(
                             rng.normal(0.0, ASKEW)
                         )
@@ -593,7 +599,7 @@ def occupy_standing(population: SceneObjects, occupancy: GroundOccupancy) -> Non
             occupancy.occupy(x, y, yaw, *body.size[:2])
 
 
-def _signs(
+def _add_signs(
     population: SceneObjects, graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, many: bool
 ) -> None:
     """Stop and yield signs: the plate is the body with a kind, the post one without."""
@@ -603,7 +609,9 @@ def _signs(
             population.add((kind, sign.style, sign.size, (population.meshes.add(mesh),)), _fixed_track(*sign.pose))
 
 
-def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:
+def _sidewalk_track(
+    graph: LaneGraph, lane: int, *, s0: float, speed: float, lateral: float, steps: int, dt: float
+) -> F64:
     """Track of somebody who walks along a sidewalk, back and forth."""
     length = float(graph.length[lane]) - 2.0
     # The distance runs over twice the length; the second half is the way back.
@@ -614,8 +622,8 @@ def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float,
     is_reversed = is_outward == (speed < 0)
     return np.stack(
         [
-            lane_states[:, 0] - aside * np.sin(lane_states[:, 2]),
-            lane_states[:, 1] + aside * np.cos(lane_states[:, 2]),
+            lane_states[:, 0] - lateral * np.sin(lane_states[:, 2]),
+            lane_states[:, 1] + lateral * np.cos(lane_states[:, 2]),
             lane_states[:, 2] + np.pi * is_reversed,
             np.full(steps, KERB),
         ],

@@ -147,7 +147,7 @@ def _free_place(x: float, y: float, yaw: float, occupancy: GroundOccupancy) -> t
         for backward in (0.0, 0.6, 1.2):
             spot_x = x + outward * float(np.sin(yaw)) - backward * float(np.cos(yaw))
             spot_y = y - outward * float(np.cos(yaw)) - backward * float(np.sin(yaw))
-            if occupancy.footprint(spot_x, spot_y, yaw, ROOM, ROOM):
+            if occupancy.is_free(spot_x, spot_y, yaw, ROOM, ROOM):
                 occupancy.occupy(spot_x, spot_y, yaw, ROOM, ROOM)
                 return spot_x, spot_y
     return None

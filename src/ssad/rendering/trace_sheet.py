@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ssad.core.frames import Camera
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, U8, EpisodeTrace
@@ -16,7 +16,7 @@ from ssad.rendering.episode_scene import agent_poses
 from ssad.rendering.onboard import DAY, Onboard
 
 
-def above(pose: F64, height: float, width: int, image_height: int) -> tuple[Camera, F64]:
+def make_overhead_camera(pose: F64, height: float, width: int, image_height: int) -> tuple[Camera, F64]:
     """A camera over a place, looking straight down, the driving direction up."""
     focal = 1.2 * image_height
     camera = Camera(width, image_height, np.array([[focal, 0, width / 2], [0, focal, image_height / 2], [0, 0, 1]]))
@@ -51,15 +51,15 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
     rows = []
     for step, front_image in zip(steps, front_images, strict=True):
         pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-        overhead_camera, overhead_pose = above(pose, 42.0, camera_model.width, camera_model.height)
+        overhead_camera, overhead_pose = make_overhead_camera(pose, 42.0, camera_model.width, camera_model.height)
         scene_objects = (
             *town.objects(appearance, all_moments[step]),
             *town.lights(appearance, all_moments[step], pose[:2, 3]),
         )
         top_image = render(town.scene, [View(overhead_camera, overhead_pose, scene_objects, DAY)]).image[0]
         text = f"{step * trace.dt:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-        left = captioned(np.ascontiguousarray(np.moveaxis(front_image, 0, -1)), text, width)
-        rows.append(np.hstack([left, captioned(top_image, "from above", width)]))
+        left = add_caption(np.ascontiguousarray(np.moveaxis(front_image, 0, -1)), text, width)
+        rows.append(np.hstack([left, add_caption(top_image, "from above", width)]))
     return np.vstack(rows)
 
 

@@ -249,13 +249,15 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int, wanted_pairs:
         raise ConfigError(f"{second.run.folder}: it shares no cell with {first.run.folder}; run the same suite twice")
     note = (
         "Difference: the second minus the first, over the cells that both have. p: how often chance alone "
-        f"makes as large a difference (signs of the clusters' differences drawn anew). {METHODS}"
+        f"gives as large a difference (signs of the clusters' differences drawn anew). {METHODS}"
     )
     labels = (first.label, second.label) if first.label != second.label else ("first", "second")
     columns = (*labels, "difference", "p")
     name = "difference" if number == 1 else f"difference_{number}"
     overall_rows = [row for row in rows if row.head[1] == EVERYTHING]
     title, heads = f"{second.label} beside {first.label}", (*_heads(first.run), "Metric")
+    if first.run is second.run:
+        title = f"{first.label}: {', '.join(f'{name} beside {other}' for other, name in pairs)}"
     table = Table(name, title, heads, columns, tuple(overall_rows or rows), note)
     group_rows = tuple(row for row in rows if row.head[1] != EVERYTHING)
     groups = (
@@ -301,11 +303,11 @@ def _findings(table: Table) -> Iterator[str]:
         )
     for subject, changes in changes_by_subject.items():
         remainder = f" and {len(changes) - 4} more" if len(changes) > 4 else ""
-        yield f"{subject}: {', '.join(changes[:4])}{remainder}: more than chance alone makes."
+        yield f"{subject}: {', '.join(changes[:4])}{remainder}: larger than chance explains."
     if not tested_rows:
         yield "There is too little data to tell a difference from chance."
     elif not changes_by_subject:
-        yield "No difference is larger than chance alone makes."
+        yield "No difference is larger than chance explains."
 
 
 def _equal(first_line: Mapping[str, Any], second_line: Mapping[str, Any], ignored: Container[str]) -> bool:
@@ -359,27 +361,27 @@ def _has_replay(compared_run: ComparedRun, line: Mapping[str, Any]) -> bool:
 
 
 def _rows(
-    first: Run, second: Run, title: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
+    first: Run, second: Run, title: str, pairs: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[TableRow]:
     """Yield the differences of one subject: of all shared cells if the metrics are means, then of each group."""
     if first.kind == "driving":
-        groups = {EVERYTHING: list(own)} | {
-            group: [name for name in own if own[name]["group"] == group]
-            for group in dict.fromkeys(line["group"] for line in own.values())
+        groups = {EVERYTHING: list(pairs)} | {
+            group: [name for name in pairs if pairs[name]["group"] == group]
+            for group in dict.fromkeys(line["group"] for line in pairs.values())
         }
         for group, names in groups.items():
             first_group_lines, second_group_lines = (
-                {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (own, other)
+                {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (pairs, other)
             )
             if set(first_group_lines) & set(second_group_lines):
                 for symbol in SHOWN:
                     yield _driving_row(title, group, symbol, first_group_lines, second_group_lines)
         return
     same_seed = first.suite.get("seed") == second.suite.get("seed")
-    for name in own:
+    for name in pairs:
         if name in other:
-            for metric in _common_metrics(first, own[name], other[name]):
-                yield _score_row(title, name, metric, own[name], other[name], paired=same_seed)
+            for metric in _common_metrics(first, pairs[name], other[name]):
+                yield _score_row(title, name, metric, pairs[name], other[name], paired=same_seed)
 
 
 def _driving_row(
@@ -401,7 +403,7 @@ def _driving_row(
         if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
     ]
     difference = paired_difference(values[1], values[0], kind=kind, min_clusters=MIN_ROUTES)  # type: ignore[arg-type]
-    p_value = TableCell(sign_flip_test(values[1], values[0]), digits=4)
+    p_value = TableCell(sign_flip_test(values[1], values[0]), digits=4, smallest=1e-4)
     means = [
         TableCell(
             math.fsum(cases[name].value for name in measured_names) / len(measured_names)
@@ -445,7 +447,12 @@ def _score_row(
         )
     return TableRow(
         (title, name, metric),
-        (TableCell(first_score), TableCell(second_score), TableCell.of(difference), TableCell(p_value, digits=4)),
+        (
+            TableCell(first_score),
+            TableCell(second_score),
+            TableCell.of(difference),
+            TableCell(p_value, digits=4, smallest=1e-4),
+        ),
     )
 
 

@@ -90,8 +90,12 @@ def panels(plots: Sequence[Panel], *, label: str, columns: int = PANEL_COLUMNS) 
         left = 36 + (panel_index % columns) * (PANEL_WIDTH + PANEL_GAP)
         panel_top = 24 + (panel_index // columns) * (PANEL_HEIGHT + 46)
 
-        def position(abscissa: float, value: float, left: int = left, under: int = panel_top) -> tuple[float, float]:
-            return left + PANEL_WIDTH * abscissa, under + PANEL_HEIGHT * (1 - min(max(value / top_percent, 0.0), 1.0))
+        def position(
+            abscissa: float, value: float, left: int = left, placed_below: int = panel_top
+        ) -> tuple[float, float]:
+            return left + PANEL_WIDTH * abscissa, placed_below + PANEL_HEIGHT * (
+                1 - min(max(value / top_percent, 0.0), 1.0)
+            )
 
         elements.append(label_text(left, panel_top - 8, panel.title, class_="name"))
         for fraction in (0.0, 0.5, 1.0):

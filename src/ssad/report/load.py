@@ -65,16 +65,16 @@ class Run:
         """Title of the page: the suite's title, unless the run differs from that suite."""
         name = str(self.suite.get("name") or "SSAD")
         title = str(self.suite.get("title") or name)
-        if not self.changed or any(setting.startswith("title=") for setting in self.changed):
+        if not self.changed_settings or any(setting.startswith("title=") for setting in self.changed_settings):
             return title
-        description = f"{name} with {'; '.join(_in_words(setting) for setting in self.changed)}"
+        description = f"{name} with {'; '.join(_in_words(setting) for setting in self.changed_settings)}"
         if len(description) <= 100:
             return description
-        keys = dict.fromkeys(setting.partition("=")[0].replace("_", " ") for setting in self.changed)
+        keys = dict.fromkeys(setting.partition("=")[0].replace("_", " ") for setting in self.changed_settings)
         return textwrap.shorten(f"{title}, with other {', '.join(keys)}", 160, placeholder=" ...")
 
     @cached_property
-    def changed(self) -> tuple[str, ...]:
+    def changed_settings(self) -> tuple[str, ...]:
         """Settings that differ from the suite of this name, as KEY=VALUE; those that change no result are left out."""
         arguments = shlex.split(self.command)
         settings = [argument for option, argument in itertools.pairwise(arguments) if option == "--set"]

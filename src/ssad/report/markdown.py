@@ -22,7 +22,7 @@ def run_markdown(run: Run, tables: Iterable[Table], verdict: Sequence[str] = ())
         verdict: Findings in sentences.
     """
     blocks = [f"# {run.title}"]
-    if not run.changed and run.suite.get("description"):
+    if not run.changed_settings and run.suite.get("description"):
         blocks.append(str(run.suite["description"]))
     if verdict:
         blocks.append("\n".join(f"* {sentence}" for sentence in verdict))

@@ -39,6 +39,7 @@ class TableCell:
     clusters: int = 0
     method: str = ""
     digits: int = 2
+    smallest: float = 0.0  # smallest number that is written out; of smaller ones it is only said that they are
 
     @classmethod
     def of(cls, estimate: Estimate) -> TableCell:
@@ -55,6 +56,8 @@ class TableCell:
     @property
     def text(self) -> str:
         """The number, or n/a."""
+        if 0.0 <= self.mean < self.smallest:
+            return f"<{self.smallest:.{self.digits}f}"
         return "n/a" if math.isnan(self.mean) else f"{self.mean:.{self.digits}f}"
 
     @property

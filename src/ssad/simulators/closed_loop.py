@@ -14,7 +14,7 @@ from ssad.core import safeio
 from ssad.core.driving import Driver, LoopChanges, ReadingChange, Sensor, Simulator
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
 from ssad.core.registry import Reference, check_arguments, make, resolve
 from ssad.core.source import plugin_version, source_version
@@ -94,13 +94,13 @@ def make_simulator(
     return simulator
 
 
-def load_world(device: str) -> None:
+def load_kernels(device: str) -> None:
     """Load the world's kernels, which are compiled on first use."""
     import warp
 
     import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
 
-    quiet_warp()
+    start_warp_quietly()
     warp.force_load(device=device)
 
 
@@ -142,7 +142,7 @@ def system_version(name: str) -> str:
         return f"{source_hash} {safeio.read_json(SHIPPED / f'{weights_name}.json')['hash'][:12]}"
     version_of_parts = getattr(system_type, "version_of_parts", None)
     if callable(version_of_parts):  # of a perceiving system whose parts are named by its arguments
-        return f"{source_hash} {version_of_parts(**Reference.of(name).options)}".strip()
+        return f"{source_hash} {version_of_parts(**Reference.parse(name).options)}".strip()
     return f"{source_hash} {weights_version(name)[:12]}".strip()
 
 
@@ -156,20 +156,20 @@ def type_version(name: str) -> str:
 
     The type that highway-env runs has the version of highway-env appended.
     """
-    from ssad.scenarios.dynamic.catalog import TYPES
+    from ssad.scenarios.dynamic.catalogue import TYPES
 
     source_hash = plugin_version("scenario", TYPES, name)
     return f"{source_hash} {version('highway-env')}".strip() if name == HIGHWAY_TYPE else source_hash
 
 
-def runs_in_highway_env(order: EpisodeRequest) -> bool:
+def runs_in_highway_env(request: EpisodeRequest) -> bool:
     """Return True if highway-env runs an episode, and not the embedded world."""
-    return bool(order.spec["scenario"]["type"] == HIGHWAY_TYPE)
+    return bool(request.spec["scenario"]["type"] == HIGHWAY_TYPE)
 
 
-def runs_embedded(order: EpisodeRequest) -> bool:
+def runs_embedded(request: EpisodeRequest) -> bool:
     """Return True if SSAD's own world runs an episode."""
-    return not runs_in_highway_env(order) and "simulator" not in order.spec
+    return not runs_in_highway_env(request) and "simulator" not in request.spec
 
 
 def town_version(graph: LaneGraph) -> str:
@@ -184,12 +184,12 @@ def town_version(graph: LaneGraph) -> str:
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
     """Return a scenario as plain data, as it stands in YAML, with its defaults written out."""
-    plain: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
-    return plain
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return data
 
 
-def episode_of(order: EpisodeRequest) -> Episode:
-    """The concrete episode of an order.
+def build_requested_episode(request: EpisodeRequest) -> Episode:
+    """The concrete episode of a request.
 
     Raises:
         RouteError: It cannot be built.
@@ -199,17 +199,18 @@ def episode_of(order: EpisodeRequest) -> Episode:
     from ssad.scenarios.dynamic import build_episode, scenario_from
     from ssad.simulators.highway_env import highway_episode
 
-    scenario = scenario_from(order.spec["scenario"])
-    if runs_in_highway_env(order):
-        seed = order.seed if order.spec["repetition"] else scenario.seed
-        return replace(highway_episode(scenario, seed), key=order.key)
+    scenario = scenario_from(request.spec["scenario"])
+    if runs_in_highway_env(request):
+        seed = request.seed if request.spec["repetition"] else scenario.seed
+        return replace(highway_episode(scenario, seed), key=request.key)
     return replace(
-        build_episode(scenario, cached_town(scenario.town), seed=order.seed, spread=order.spec["spread"]), key=order.key
+        build_episode(scenario, cached_town(scenario.town), seed=request.seed, spread=request.spec["spread"]),
+        key=request.key,
     )
 
 
 def drive(
-    orders: Sequence[EpisodeRequest],
+    requests: Sequence[EpisodeRequest],
     *,
     device: str,
     driver: Driver | None = None,
@@ -217,32 +218,32 @@ def drive(
     perturbation: LoopChanges | Mapping[str, ReadingChange] | None = None,
     key: Callable[[EpisodeRequest], str] = attrgetter("key"),
 ) -> tuple[list[Episode], list[EpisodeTrace], Mapping[str, Any]]:
-    """Episodes and traces of orders that share a system and a simulator, run as one batch.
+    """Return episodes and traces of requests that share a system and a simulator, run as one batch.
 
-    The third is what a simulator counts by sensors of its own (`ssad.simulators.carla.events`), which drives one order
-    at a time; else it is empty.
+    The third is what a simulator counts by sensors of its own (`ssad.simulators.carla.events`), which drives one
+    request at a time; else it is empty.
 
     Args:
-        orders: What is to be driven.
+        requests: What is to be driven.
         device: Where the world computes.
-        driver: Who drives; None: the system that the orders name.
+        driver: Who drives; None: the system that the requests name.
         sensors: What drivers may ask for; None: `onboard_sensors`.
         perturbation: Changes between sensors, driver and vehicle; see `ssad.world.rollout.rollout`.
-        key: Of the episodes, on which the noise of sensors depends; traces have those of their orders.
+        key: Of the episodes, on which the noise of sensors depends; traces have those of their requests.
     """
     from ssad.drivers import make_system
     from ssad.simulators.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
 
     # Runs that are to be compared can share the noise of their sensors through this key.
-    episodes = [replace(episode_of(request), key=key(request)) for request in orders]
+    episodes = [replace(build_requested_episode(request), key=key(request)) for request in requests]
     graphs = {episode.town: cached_town(episode.town) for episode in episodes}
-    system = driver or system_of(orders[0].system)
+    system = driver or system_of(requests[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
     for agent_driver in (system, *policies.values()):
         if callable(getattr(agent_driver, "to", None)):
             agent_driver.to(device)  # type: ignore[attr-defined]
-    simulator_name = orders[0].spec.get("simulator", EMBEDDED)
+    simulator_name = requests[0].spec.get("simulator", EMBEDDED)
     simulator: Simulator
     if is_carla(simulator_name):
         from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
@@ -260,7 +261,7 @@ def drive(
             sensors = onboard_sensors(list(policies.values()), device) | {
                 name: CarlaSensor(name) for name in carla_cameras
             }
-    elif runs_in_highway_env(orders[0]):
+    elif runs_in_highway_env(requests[0]):
         simulator = HighwayEnv(episodes, graphs)
     else:
         simulator = make_simulator(simulator_name, episodes, graphs, device=device)
@@ -274,7 +275,7 @@ def drive(
         getattr(simulator, "close", lambda: None)()
     return (
         episodes,
-        [replace(trace, key=request.key) for trace, request in zip(traces, orders, strict=True)],
+        [replace(trace, key=request.key) for trace, request in zip(traces, requests, strict=True)],
         simulator_metrics,
     )
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ssad.core.driving import Scenes
 from ssad.core.errors import ConfigError
-from ssad.core.lane_graph import LaneGraph, Marking, no_signals
+from ssad.core.lane_graph import LaneGraph, Marking, empty_signal_arrays
 from ssad.core.types import (
     F32,
     I32,
@@ -35,7 +35,7 @@ from ssad.core.types import (
     Scenario,
 )
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
-from ssad.simulators.mirrored import Mirrored
+from ssad.simulators.mirrored import MirroredSimulator
 from ssad.world.kernels.data import Presence
 from ssad.world.world import World
 
@@ -188,7 +188,7 @@ def highway_town(name: str) -> LaneGraph:
         right_marking=np.array([marking_of_line[lane.line_types[1]] for lane in lanes], np.uint8),
         succ_offset=np.cumsum([0, *(len(lane_successors) for lane_successors in successors)]).astype(np.int32),
         succ=np.array([lane_index for lane_successors in successors for lane_index in lane_successors], np.int32),
-        **no_signals(),
+        **empty_signal_arrays(),
     )
 
 
@@ -269,7 +269,7 @@ def _traffic(
 SCENARIO = ScenarioType("HighwayEnv", "highway-env", "none: the traffic of highway-env", _traffic)
 
 
-class HighwayEnv(Mirrored):
+class HighwayEnv(MirroredSimulator):
     """A `Simulator` of `ssad.core.driving` in which highway-env moves everybody; a scene is one of its environments.
 
     `mirror` is the `World` that mirrors it. Agents that a driver takes over are driven by their controls or planned in

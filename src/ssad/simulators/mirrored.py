@@ -10,7 +10,7 @@ from ssad.core.types import I32, Bool, Controller
 from ssad.world.world import World
 
 
-class Mirrored:
+class MirroredSimulator:
     """A simulator whose state is copied into an embedded world at each step.
 
     Attributes:

@@ -19,8 +19,16 @@ from ssad.core.types import Scenario
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.training.driver import VALIDATION_SEED, draw_episodes, find_scenarios
-from ssad.training.recipe import set_words
-from ssad.training.reinforcement import LEARNINGS, Learning, Say, find_learning, finish, learn, make_model
+from ssad.training.recipe import command_line_changes
+from ssad.training.reinforcement import (
+    POLICY_RECIPES,
+    PolicyRecipe,
+    Say,
+    find_policy_recipe,
+    finish,
+    make_model,
+    train_policy,
+)
 from ssad.world.policy import Policy, PolicyDriver
 from ssad.world.selection import FreaSelection
 
@@ -33,7 +41,7 @@ _SETTING: dict[str, Any] = {
 }
 ADVERSARIES = {
     "adv-ppo": replace(
-        LEARNINGS["ppo"],
+        POLICY_RECIPES["ppo"],
         steps=200_000,
         **_SETTING,
         lr=3e-4,
@@ -45,7 +53,7 @@ ADVERSARIES = {
 ADVERSARIES |= {
     "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=3),
     "adv-sac": replace(
-        LEARNINGS["sac"],
+        POLICY_RECIPES["sac"],
         steps=100_000,
         **_SETTING,
         lr=3e-4,
@@ -53,7 +61,7 @@ ADVERSARIES |= {
         validate=25_000,
     ),
     "adv-ddpg": replace(
-        LEARNINGS["td3"],
+        POLICY_RECIPES["td3"],
         algorithm="ddpg",
         steps=100_000,
         **_SETTING,
@@ -61,7 +69,7 @@ ADVERSARIES |= {
         validate=25_000,
     ),
     "adv-dqn": replace(
-        LEARNINGS["sac"],
+        POLICY_RECIPES["sac"],
         algorithm="dqn",
         steps=100_000,
         **_SETTING,
@@ -110,7 +118,7 @@ class AdversaryPlan:
         return self.scenarios or SCENARIOS.get(self.algorithm, ("training",))
 
 
-def natural_only(references: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
+def natural_scenarios(references: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
     """The scenarios of some sets that have background traffic, and the lane graphs of their towns."""
     scenarios, graphs = find_scenarios(references)
     with_traffic = [
@@ -145,7 +153,7 @@ def measure_adversary(
     outcomes = trials.run(proposals)
     shares = {
         "CR": [outcome.trace is not None and outcome.trace.end == "collision" for outcome in outcomes],
-        "valid": [outcome.valid for outcome in outcomes],
+        "valid": [outcome.is_valid for outcome in outcomes],
         "off": [outcome.off_road for outcome in outcomes],
         "others": [outcome.hit_others for outcome in outcomes],
     }
@@ -166,7 +174,7 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         ConfigError: The plan is not valid, there is no traffic to learn in, or the training diverged.
         FormatError: The checkpoint is broken or belongs to another training.
     """
-    learning = find_learning(ADVERSARIES, plan.algorithm, dict(plan.changes))
+    learning = find_policy_recipe(ADVERSARIES, plan.algorithm, dict(plan.changes))
     if learning.reward not in REWARDS:
         raise unknown_name("reward of an adversary", learning.reward, REWARDS)
     if plan.literal and learning.reward != "adversary":
@@ -174,7 +182,7 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
     ego = make_system(plan.ego)
     safeio.make_folder(plan.out)
     torch.set_num_threads(1)
-    scenarios, graphs = natural_only(plan.learned_in())
+    scenarios, graphs = natural_scenarios(plan.learned_in())
     if not scenarios:
         raise ConfigError(
             f"{', '.join(plan.learned_in())}: no scenario has background traffic to take adversaries from"
@@ -193,7 +201,9 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
     fingerprint = digest(
         "adversary training", plan.ego, plan.literal, plan.off_road, *(episode.key for episode in episodes)
     )[:16]
-    state = learn(model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, about=fingerprint)
+    state = train_policy(
+        model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, metadata=fingerprint
+    )
     if state["steps"] < learning.steps:
         report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
     description = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
@@ -206,14 +216,14 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         data=f"{description}; ego {plan.ego}",
         command=command_of(plan),
         test=measure_all(plan),
-        about={"ego": plan.ego},
+        metadata={"ego": plan.ego},
     )
 
 
-def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs: Any, ego: Driver) -> Any:
-    from ssad.training.reinforcement import require
+def _environment(learning: PolicyRecipe, plan: AdversaryPlan, episodes: Any, graphs: Any, ego: Driver) -> Any:
+    from ssad.training.reinforcement import import_sb3
 
-    require()
+    import_sb3()
     from ssad.training.adversary_env import AdversaryEnv
 
     return AdversaryEnv(
@@ -236,7 +246,7 @@ def measure_all(plan: AdversaryPlan) -> Callable[[Driver], dict[str, float]]:
     def test_driver(driver: Driver) -> dict[str, float]:
         metrics: dict[str, float] = {}
         for reference in plan.test:
-            scenarios, graphs = natural_only([reference])
+            scenarios, graphs = natural_scenarios([reference])
             set_metrics = measure_adversary(driver, plan.ego, scenarios, graphs, seed=0)
             metrics |= {f"{Path(reference).stem}_{name}": round(value, 4) for name, value in set_metrics.items()}
         return metrics
@@ -253,4 +263,4 @@ def command_of(plan: AdversaryPlan) -> str:
     arguments += ["--test", ",".join(plan.test)] if plan.test != defaults.test else []
     arguments += ["--literal"] if plan.literal else []
     arguments += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != defaults.off_road else []
-    return shlex.join([*arguments, *set_words(plan.changes)])
+    return shlex.join([*arguments, *command_line_changes(plan.changes)])

@@ -108,7 +108,7 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         self.loop.step(controls)
         state = world.state()
         if self._hindsight is not None:
-            self._hindsight.note(state)
+            self._hindsight.record(state)
         reward = np.zeros(self.num_envs)
         rewards: F64 = self._reward(state, agents, before_step)
         reward[active_scenes] = self._scale * rewards
@@ -148,7 +148,7 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         assert self._hindsight is not None
         avoidable = hit_ego(state, agents)
         if avoidable.any():
-            avoidable[avoidable] = self._hindsight.avoided(state, agents[avoidable])
+            avoidable[avoidable] = self._hindsight.is_avoidable(state, agents[avoidable])
         return feasible(state, agents, previous_cost, avoidable, off_road=off_road)
 
     def _draw(self, count: int) -> I32:
@@ -172,9 +172,9 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             self.world.take(selected & ~is_taken, Controller.EXTERNAL, policy=_ADVERSARY)
         self._adversaries = adversary
 
-    def _observe(self, who: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
+    def _observe(self, agent_indices: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
         """[num_envs, 24]; zeros where there is no adversary."""
         # The sensor needs a valid agent in every row; rows without an adversary are zeroed below.
-        agents = np.stack([np.arange(self.num_envs), np.maximum(who, 0)], 1).astype(np.int32)
+        agents = np.stack([np.arange(self.num_envs), np.maximum(agent_indices, 0)], 1).astype(np.int32)
         rows = SENSORS["adversary"](self.world, agents)
-        return np.where((who >= 0)[:, None], rows, 0.0).astype(np.float32)
+        return np.where((agent_indices >= 0)[:, None], rows, 0.0).astype(np.float32)

@@ -34,7 +34,7 @@ class TrainingImage:
 
 
 @dataclass(frozen=True, slots=True)
-class OnDisk:
+class ImagesOnDisk:
     """Images that are read on access: uint8 [n, H, W, 3] for indices [n] or a slice."""
 
     items: Sequence[TrainingImage]
@@ -52,17 +52,17 @@ class OnDisk:
 
 
 @dataclass(frozen=True, slots=True)
-class PictureSet:
+class ImageSet:
     """All images of a set, uint8 [N, H, W, 3], and their truth (on the CPU)."""
 
-    pictures: Tensor | OnDisk
+    pictures: Tensor | ImagesOnDisk
     truth: tuple[Truth, ...]
 
     def __len__(self) -> int:
         return len(self.truth)
 
 
-def fill(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
+def load_images(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | None = None) -> ImageSet:
     """Read all images, in parallel, into the fastest memory that has room for them.
 
     That is the device, else the host; if neither has room, images stay on disk and are read on access.
@@ -87,7 +87,7 @@ def fill(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | 
         (candidate for candidate in (device, "cpu") if required_bytes < MEMORY_SHARE * free_memory(candidate)), ""
     )
     if not device:
-        return PictureSet(OnDisk(items, shape), truth)
+        return ImageSet(ImagesOnDisk(items, shape), truth)
     images = torch.empty((len(items), *shape), dtype=torch.uint8, device=device)
 
     def load(first_index: int) -> None:
@@ -96,7 +96,7 @@ def fill(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | 
 
     with ThreadPoolExecutor(threads or max(8, (os.cpu_count() or 8) // 4)) as pool:
         list(pool.map(load, range(0, len(items), 32)))
-    return PictureSet(images, truth)
+    return ImageSet(images, truth)
 
 
 def _read(items: Sequence[TrainingImage], image_count: int, shape: tuple[int, ...]) -> Tensor:
@@ -117,7 +117,7 @@ def free_memory(device: str) -> float:
         return math.inf
 
 
-def repeats(truths: Sequence[Truth], min_share: float) -> F64 | None:
+def repetition_counts(truths: Sequence[Truth], min_share: float) -> F64 | None:
     """Return the number of repetitions of each image in an epoch, so that rare classes are seen.
 
     An image is shown at least once; it is shown sqrt(min_share / share) times if it shows a class whose share of the
@@ -221,7 +221,7 @@ class Augmentation:
     shift: tuple[float, float]
 
 
-def draw_change(
+def draw_augmentation(
     recipe: Recipe, size: tuple[int, int], rng: np.random.Generator, *, lens: Tensor | None = None
 ) -> Augmentation:
     """A random change of a picture of `size` (height, width).
@@ -241,7 +241,7 @@ def draw_change(
     return Augmentation(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
 
 
-def change_truths(
+def augment_truths(
     truths: Sequence[Truth], changes: Sequence[Augmentation], size: tuple[int, int], *, min_visible_share: float
 ) -> list[Truth]:
     """Return the truth of augmented images.
@@ -273,11 +273,11 @@ def change_truths(
     area = (box[:, 2:] - box[:, :2]).prod(-1).clamp_min(1e-6)
     # A zoom changes both areas alike, so the share measures clipping only.
     visible_share = (clipped[:, 2:] - clipped[:, :2]).prod(-1) / area
-    intrinsics = _changed_lens([image_truth.intrinsic for image_truth in truths], mirror, zoom, shift, width)
+    intrinsics = _augment_intrinsics([image_truth.intrinsic for image_truth in truths], mirror, zoom, shift, width)
     solid = (
         None
         if truths[0].solid is None or intrinsics is None
-        else _mirrored([image_truth.solid for image_truth in truths], mirror[image_index])
+        else _mirror_solids([image_truth.solid for image_truth in truths], mirror[image_index])
     )
     is_crowd = torch.cat(
         [
@@ -321,7 +321,7 @@ def change_truths(
     ]
 
 
-def _changed_lens(
+def _augment_intrinsics(
     lenses: Sequence[Tensor | None], mirror: Tensor, zoom: Tensor, shift: Tensor, width: int
 ) -> Tensor | None:
     """Intrinsics [B, 3, 3] of the changed pictures; None where there are none."""
@@ -335,7 +335,7 @@ def _changed_lens(
     return intrinsics
 
 
-def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
+def _mirror_solids(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
     """Return all solids in one table, those of mirrored images mirrored."""
     present_solids = [solid for solid in solids if solid is not None]
     table = Solids.cat(present_solids)
@@ -349,7 +349,7 @@ def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
     )
 
 
-def change_pictures(images: Tensor, changes: Sequence[Augmentation]) -> Tensor:
+def augment_images(images: Tensor, changes: Sequence[Augmentation]) -> Tensor:
     """Return images, float [B, 3, H, W], after their augmentation; grey where there is nothing.
 
     Below a zoom of `HALVING_ZOOM` samples are taken from the image averaged to half its size: at full size they would
@@ -379,7 +379,7 @@ def change_pictures(images: Tensor, changes: Sequence[Augmentation]) -> Tensor:
     return augmented + GREY
 
 
-def change_colours(images: Tensor, recipe: Recipe, rng: torch.Generator) -> Tensor:
+def augment_colours(images: Tensor, recipe: Recipe, rng: torch.Generator) -> Tensor:
     """Brightness, contrast, saturation and gamma of each picture moved at random; noise added; in [0, 1]."""
     if recipe.jitter <= 0 and recipe.noise <= 0:
         return images
@@ -405,14 +405,14 @@ def change_colours(images: Tensor, recipe: Recipe, rng: torch.Generator) -> Tens
 
 
 def make_batch(
-    bank: PictureSet, indices: Sequence[int], recipe: Recipe, *, key: tuple[int, ...], device: torch.device
+    image_set: ImageSet, indices: Sequence[int], recipe: Recipe, *, key: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, list[Truth]]:
     """Return images float [B, 3, H, W] and their truth on the device, augmented at random by the key."""
     random = np.random.default_rng(key)
     torch_random = torch.Generator().manual_seed(int(random.integers(2**62)))
-    selected = _send(torch.tensor(indices), bank.pictures.device)
-    images = bank.pictures[selected].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
+    selected = _send(torch.tensor(indices), image_set.pictures.device)
+    images = image_set.pictures[selected].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
     size = (images.shape[2], images.shape[3])
-    changes = [draw_change(recipe, size, random, lens=bank.truth[index].intrinsic) for index in indices]
-    truths = change_truths([bank.truth[index] for index in indices], changes, size, min_visible_share=recipe.keep)
-    return change_colours(change_pictures(images, changes), recipe, torch_random), move(truths, device)
+    changes = [draw_augmentation(recipe, size, random, lens=image_set.truth[index].intrinsic) for index in indices]
+    truths = augment_truths([image_set.truth[index] for index in indices], changes, size, min_visible_share=recipe.keep)
+    return augment_colours(augment_images(images, changes), recipe, torch_random), move(truths, device)

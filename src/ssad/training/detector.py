@@ -19,7 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
-from ssad.core.checkpoints import WeightsCard, hash_state, load_weights, save_weights, start_from
+from ssad.core.checkpoints import WeightsCard, copy_matching_weights, hash_state, load_weights, save_weights
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -29,10 +29,10 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
-from ssad.training.batches import PictureSet, TrainingImage, fill
+from ssad.training.batches import ImageSet, TrainingImage, load_images
 from ssad.training.data import nuscenes_items
-from ssad.training.loop import LAST_CHECKPOINT, LOG, Share, read_last, read_rows, train, write_row
-from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
+from ssad.training.loop import LAST_CHECKPOINT, LOG, ProcessRank, read_last, read_rows, train, write_row
+from ssad.training.recipe import Recipe, command_line_changes, find_recipe, recipe_data
 
 Say = Callable[[str], None]
 VAL_SCENES = 4  # scenes of a nuScenes data set for validation during training; the final validation uses all
@@ -138,10 +138,10 @@ def run_training(plan: DetectorPlan, *, report: Say = print) -> Iterator[str]:
         if device != "cuda" or torch.cuda.device_count() < plan.gpus:
             raise ConfigError(f"--gpus {plan.gpus}: this machine has {torch.cuda.device_count()} usable GPUs")
         safeio.make_folder(plan.out)
-        with _one_line():
+        with _rewrap_worker_errors():
             spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
-        _run(plan, recipe, device, Share(), report)
+        _run(plan, recipe, device, ProcessRank(), report)
     log_lines = safeio.read_text(plan.out / LOG).splitlines()
     yield (
         f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log_lines)} epochs; card, {LOG} and curves.png beside it"
@@ -149,7 +149,7 @@ def run_training(plan: DetectorPlan, *, report: Say = print) -> Iterator[str]:
 
 
 @contextmanager
-def _one_line() -> Iterator[None]:
+def _rewrap_worker_errors() -> Iterator[None]:
     """Re-raise an SSADError of a worker process, which arrives as the text of its traceback."""
     try:
         yield
@@ -185,17 +185,17 @@ def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: s
         device = f"cuda:{rank}" if backend == "nccl" else "cpu"
         if backend == "nccl":
             torch.cuda.set_device(rank)
-        _run(plan, recipe, device, Share(rank, process_count), partial(print, flush=True))
+        _run(plan, recipe, device, ProcessRank(rank, process_count), partial(print, flush=True))
     finally:
         distributed.destroy_process_group()
 
 
-def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: Say) -> None:
+def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, report: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
-    sources, options = _items(plan, is_3d=recipe.three)
+    sources, options = _items(plan, is_3d=recipe.is_3d)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
-        unmatched_weights = start_from(detector, load_weights(plan.weights), str(plan.weights))
+        unmatched_weights = copy_matching_weights(detector, load_weights(plan.weights), str(plan.weights))
         if unmatched_weights:
             report(
                 f"{plan.weights}: {len(unmatched_weights)} weights do not fit and start fresh: "
@@ -203,8 +203,8 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
             )
     fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
     checkpoint = read_last(plan.out / LAST_CHECKPOINT, recipe, fingerprint)
-    validate = _validation(plan, device, is_3d=recipe.three)
-    initial_weights = _before(plan.weights)
+    validate = _validation(plan, device, is_3d=recipe.is_3d)
+    initial_weights = _weights_origin(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
     completed, last_epoch = (
         (checkpoint["epoch"], recipe.last_epoch(checkpoint["epoch"], checkpoint["spent"], checkpoint["quickest"]))
@@ -220,7 +220,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
     report(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
     trained = train(
         detector,
-        fill(own_sources, device=device),
+        load_images(own_sources, device=device),
         recipe,
         out=plan.out,
         device=device,
@@ -228,7 +228,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
         report=report,
         share=share,
         seconds=plan.seconds,
-        about=fingerprint,
+        metadata=fingerprint,
     )
     if share.rank:
         return
@@ -251,7 +251,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
     draw_curves(plan.out)
 
 
-def _before(weights: Path | None) -> dict[str, Any]:
+def _weights_origin(weights: Path | None) -> dict[str, Any]:
     """Return the origin of the initial weights, recursively, from the card beside them.
 
     The file beside the weights may not be an SSAD card; missing entries are omitted.
@@ -348,7 +348,7 @@ def command_of(plan: DetectorPlan) -> str:
         ("--seconds", plan.seconds, None),
     ):
         arguments += [option, str(value)] if value != default_value else []
-    return shlex.join([*arguments, *set_words(plan.changes)])
+    return shlex.join([*arguments, *command_line_changes(plan.changes)])
 
 
 def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[..., dict[str, float]]:
@@ -370,18 +370,18 @@ def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[...
     for folder in plan.data:
         if not coco_items(folder, split)[1]:
             raise ConfigError(f"{folder}: no picture to validate on in annotations/{split}.json")
-    images_by_folder: dict[str, PictureSet] = {}
+    images_by_folder: dict[str, ImageSet] = {}
 
     def check_2d(detector: Any, *, quick: bool) -> dict[str, float]:
         metrics: dict[str, float] = {}
         for folder in plan.data:
             if folder.name not in images_by_folder:
-                images_by_folder[folder.name] = fill(coco_items(folder, split)[1], device=device)
+                images_by_folder[folder.name] = load_images(coco_items(folder, split)[1], device=device)
             image_set = images_by_folder[folder.name]
             coco_set = read_coco(folder / "annotations" / f"{split}.json")
             scores = score_2d(detector, image_set, classes=coco_set.classes, device=device)
             metrics |= {f"{folder.name}_{name}": value for name, value in scores.items()}
-            target_set = PictureSet(image_set.pictures, tuple(coco_truth(coco_set, target=True)))
+            target_set = ImageSet(image_set.pictures, tuple(coco_truth(coco_set, target=True)))
             metrics[f"{folder.name}_target_AP50"] = score_2d(
                 detector, target_set, classes=coco_set.classes, device=device
             )["AP50"]

@@ -20,16 +20,16 @@ from ssad.core.types import Episode, Scenario
 from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.training.recipe import set_words
+from ssad.training.recipe import command_line_changes
 from ssad.training.reinforcement import (
-    LEARNINGS,
+    POLICY_RECIPES,
     Say,
-    begin_with,
-    find_learning,
+    find_policy_recipe,
     finish,
-    learn,
+    import_sb3,
+    load_start_networks,
     make_model,
-    require,
+    train_policy,
 )
 from ssad.world.env import VectorEnv, reward_of
 from ssad.world.policy import Policy, PolicyDriver
@@ -133,8 +133,8 @@ def run_driver_training(plan: DriverPlan, *, report: Say = print) -> Iterator[st
         ConfigError: The plan is not valid, or the training diverged.
         FormatError: The checkpoint is broken or belongs to another training.
     """
-    learning = find_learning(LEARNINGS, plan.algorithm, dict(plan.changes))
-    require()
+    learning = find_policy_recipe(POLICY_RECIPES, plan.algorithm, dict(plan.changes))
+    import_sb3()
     safeio.make_folder(plan.out)
     torch.set_num_threads(1)  # a second thread slows down networks this small
     reward = reward_of(learning.reward)
@@ -155,7 +155,7 @@ def run_driver_training(plan: DriverPlan, *, report: Say = print) -> Iterator[st
         policies=make_system,
     )
     model = make_model(learning, SB3VecEnv(environment), device=plan.device)
-    start_hash = "" if plan.start is None else begin_with(model, learning, plan.start)
+    start_hash = "" if plan.start is None else load_start_networks(model, learning, plan.start)
     # The first draw is nominal and part of the training; only the second one is held out.
     validation_episodes = draw_episodes(scenarios, graphs, draws=2, seed=VALIDATION_SEED)[len(scenarios) :]
     validation_episodes = validation_episodes[:: max(len(validation_episodes) // MOST_VALIDATION, 1)]
@@ -166,14 +166,14 @@ def run_driver_training(plan: DriverPlan, *, report: Say = print) -> Iterator[st
 
     episode_keys = (safeio.dump_json([episode.key, episode.seed]) for episode in episodes)
     fingerprint = digest("driver training", *episode_keys, *([start_hash] if start_hash else []))[:16]
-    state = learn(
+    state = train_policy(
         model,
         learning,
         plan.out,
         validate=validate,
         report=report,
         seconds=plan.seconds,
-        about=fingerprint,
+        metadata=fingerprint,
     )
     if state["steps"] < learning.steps:
         report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
@@ -207,4 +207,4 @@ def command_of(plan: DriverPlan) -> str:
         arguments += ["--test", ",".join(plan.test)]
     if plan.start is not None:
         arguments += ["--start", str(plan.start)]
-    return shlex.join([*arguments, *set_words(plan.changes)])
+    return shlex.join([*arguments, *command_line_changes(plan.changes)])

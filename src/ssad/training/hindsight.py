@@ -23,7 +23,7 @@ from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_start
 from ssad.drivers.careful.models import CarefulModel, careful_model, initial_reaction, react
 from ssad.drivers.careful.sight import BEHIND, Path, encounters_on_paths
 from ssad.metrics.criticality import time_to_collision
-from ssad.scenarios.dynamic.frozen import braked
+from ssad.scenarios.dynamic.frozen import brake
 
 ROUTE_POINTS = 120  # points of the ego's route, 1 m apart
 
@@ -52,7 +52,7 @@ class Hindsight:
         self._point = np.zeros((rows, scenes), np.int64)  # of the ego's route
         self._known_steps = np.zeros(scenes, np.int64)
 
-    def note(self, state: WorldState) -> None:
+    def record(self, state: WorldState) -> None:
         """Record the state of a step."""
         for rows in (self._motion, self._point):
             rows[:-1] = rows[1:]
@@ -64,7 +64,7 @@ class Hindsight:
         """Clear the record of restarted scenes."""
         self._known_steps[np.asarray(scenes)] = 0
 
-    def avoided(self, state: WorldState, agents: I32) -> Bool:
+    def is_avoidable(self, state: WorldState, agents: I32) -> Bool:
         """Return [N] True where the careful driver stays clear until 5 s after now.
 
         Args:
@@ -72,7 +72,7 @@ class Hindsight:
             agents: [N, 2] scene and agent in contact with the ego.
         """
         scene, agent = agents.T
-        danger_row = np.array([self._begins(state, *pair) for pair in agents.tolist()], np.int64)
+        danger_row = np.array([self._danger_row(state, *pair) for pair in agents.tolist()], np.int64)
         steps = np.arange(len(self._motion) + round(AFTER / self.dt))
         rows = danger_row[:, None] + steps
         last_row = len(self._motion) - 1
@@ -109,7 +109,7 @@ class Hindsight:
         distance = obb_distance(ego, np.concatenate([local_positions, yaw[..., None], other_size], -1))
         return np.asarray(((distance > 0.0) | (rows > last_row + round(AFTER / self.dt))).all(1))
 
-    def _begins(self, state: WorldState, scene: int, agent: int) -> int:
+    def _danger_row(self, state: WorldState, scene: int, agent: int) -> int:
         """Return the row at which the danger begins."""
         first_row = max(len(self._motion) - int(self._known_steps[scene]), 0)
         motion = self._motion[first_row:, scene][:, [0, agent]]
@@ -166,5 +166,5 @@ class Hindsight:
 def _stopping(motion: F64, delay: F64) -> F64:
     """Return rows [N, T, 4] of x, y, yaw and speed of an agent that brakes to a stop from `delay` = 0 s on."""
     x, y, yaw, speed = np.moveaxis(motion, -1, 0)
-    distance, speed_left = braked(speed, delay)
+    distance, speed_left = brake(speed, delay)
     return np.stack([x + distance * np.cos(yaw), y + distance * np.sin(yaw), yaw, speed_left], -1)

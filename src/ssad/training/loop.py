@@ -20,14 +20,14 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.seeding import seed32
 from ssad.scenarios.static.digital.budget import Budget, px
-from ssad.training.batches import PictureSet, make_batch, order, repeats
+from ssad.training.batches import ImageSet, make_batch, order, repetition_counts
 from ssad.training.recipe import Recipe, recipe_data
 
 LOG = "log.jsonl"
 LAST_CHECKPOINT = "last.pt"
 
 
-class Step(nn.Module):
+class TrainingStep(nn.Module):
     """Losses of a batch as one module, so that gradients can be shared between devices."""
 
     def __init__(self, detector: Any, *, amp: bool, doubt: float = 0.0) -> None:
@@ -51,7 +51,7 @@ class Step(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class ProcessRank:
     """Rank of this process among `world` processes."""
 
     rank: int = 0
@@ -60,16 +60,16 @@ class Share:
 
 def train(
     detector: Any,
-    bank: PictureSet,
+    image_set: ImageSet,
     recipe: Recipe,
     *,
     out: Path,
     device: str = "cpu",
     validate: Callable[[Any], dict[str, float]] | None = None,
     report: Callable[[str], None] = lambda line: None,
-    share: Share = Share(),
+    share: ProcessRank = ProcessRank(),
     seconds: float | None = None,
-    about: str = "",
+    metadata: str = "",
 ) -> Any:
     """Train a detector on a set of pictures.
 
@@ -77,7 +77,7 @@ def train(
 
     Args:
         detector: The detector; it is changed.
-        bank: Pictures and their truth.
+        image_set: Pictures and their truth.
         recipe: The recipe.
         out: Folder to write to.
         device: Where to train.
@@ -85,7 +85,7 @@ def train(
         report: Called with a line about progress.
         share: The part of the work of this process.
         seconds: Stop after the epoch in which this time runs out, s; it can be resumed.
-        about: What else the result depends on (data, first weights); it must be the same when the training is resumed.
+        metadata: What else the result depends on (data, first weights); it must be the same when training resumes.
 
     Returns:
         The detector to use: the average of the weights, if one is kept.
@@ -103,7 +103,7 @@ def train(
     for module in detector.modules():
         if hasattr(module, "compiled"):
             module.compiled = recipe.compile
-    loss_step = Step(detector, amp=recipe.amp, doubt=recipe.doubt)
+    loss_step = TrainingStep(detector, amp=recipe.amp, doubt=recipe.doubt)
     parallel_step: Any = loss_step
     if share.world > 1:
         device_ids = [target_device.index or 0] if target_device.type == "cuda" else None
@@ -113,11 +113,11 @@ def train(
     average = copy.deepcopy(detector).requires_grad_(False).eval() if recipe.average else None
     update_average = _follower(average, detector)
     local_batch = max(recipe.batch // share.world, 1)
-    frequencies = repeats(bank.truth, recipe.rare)
+    frequencies = repetition_counts(image_set.truth, recipe.rare)
     per_epoch = _common_count(
-        len(order(len(bank), local_batch, seed=0, epoch=0, weights=frequencies)), share, target_device
+        len(order(len(image_set), local_batch, seed=0, epoch=0, weights=frequencies)), share, target_device
     )
-    epoch, step, time_spent, fastest = _resume(out / LAST_CHECKPOINT, detector, average, optimizer, recipe, about)
+    epoch, step, time_spent, fastest = _resume(out / LAST_CHECKPOINT, detector, average, optimizer, recipe, metadata)
     start_time = time.monotonic()
     while epoch < (last_epoch := _common_count(recipe.last_epoch(epoch, time_spent, fastest), share, target_device)):
         total_steps = per_epoch * last_epoch
@@ -127,18 +127,18 @@ def train(
         learning_rate = recipe.lr
         seed = recipe.seed * 1000 + share.rank
         for batch_index, indices in enumerate(
-            order(len(bank), local_batch, seed=seed, epoch=epoch, weights=frequencies)[:per_epoch]
+            order(len(image_set), local_batch, seed=seed, epoch=epoch, weights=frequencies)[:per_epoch]
         ):
             learning_rate = recipe.rate(step, total_steps, per_epoch)
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate
             key = (recipe.seed, epoch, batch_index, share.rank)
-            images, truth = make_batch(bank, indices, recipe, key=key, device=target_device)
+            images, truth = make_batch(image_set, indices, recipe, key=key, device=target_device)
             images = images.contiguous(memory_format=memory_format)
             if recipe.radius:
-                images = harden(loss_step, images, truth, recipe, key=key)
+                images = perturb_images(loss_step, images, truth, recipe, key=key)
             losses = parallel_step(images, truth)
-            loss = weighed(losses, recipe.weigh)
+            loss = weighted_sum(losses, recipe.weigh)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             if recipe.clip:
@@ -173,7 +173,7 @@ def train(
                 "step": step,
                 "spent": time_spent,
                 "quickest": fastest,
-                "about": about,
+                "about": metadata,
                 "recipe": safeio.dump_json(recipe_data(recipe)),
             }
             _save(out, state, row)
@@ -192,7 +192,7 @@ def train(
     return result.requires_grad_(False).eval()
 
 
-def weighed(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tensor:
+def weighted_sum(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tensor:
     """Return the sum of losses times their factors, 1 by default.
 
     Args:
@@ -208,7 +208,9 @@ def weighed(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tenso
     return torch.stack([value * factors.get(name, 1.0) for name, value in losses.items()]).sum()
 
 
-def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, key: tuple[int, ...]) -> Tensor:
+def perturb_images(
+    step: TrainingStep, images: Tensor, truth: list[Truth], recipe: Recipe, *, key: tuple[int, ...]
+) -> Tensor:
     """Attack images by projected gradient ascent of the training losses from a random start.
 
     Args:
@@ -226,22 +228,22 @@ def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, ke
     detector, budget = step.detector, Budget(px(recipe.radius))
     generator = torch.Generator(images.device).manual_seed(seed32("adversarial training", *key))
     noise = 2 * torch.rand(images.shape, generator=generator, device=images.device) - 1
-    attacked = budget.project(images + budget.start(noise, "uniform"), images)
+    attacked_images = budget.project(images + budget.start(noise, "uniform"), images)
     step_length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
     training_modes = [(module, module.training) for module in detector.modules()]
     for module, _ in training_modes:
         # Attack steps must not update running statistics.
         module.training = module.training and not isinstance(module, nn.modules.batchnorm._BatchNorm)
     for _ in range(recipe.attack_steps):
-        variable = attacked.detach().requires_grad_()
+        variable = attacked_images.detach().requires_grad_()
         (gradient,) = torch.autograd.grad(torch.stack(list(step(variable, truth).values())).sum(), variable)
-        attacked = budget.project(attacked + step_length * budget.steepest(gradient), images)
+        attacked_images = budget.project(attacked_images + step_length * budget.steepest(gradient), images)
     for module, mode in training_modes:
         module.training = mode
-    return attacked
+    return attacked_images
 
 
-def _common_count(count: int, share: Share, device: torch.device) -> int:
+def _common_count(count: int, share: ProcessRank, device: torch.device) -> int:
     """The least of all processes' counts: their shares of the data differ, their numbers of steps must not."""
     if share.world == 1:
         return count
@@ -250,7 +252,7 @@ def _common_count(count: int, share: Share, device: torch.device) -> int:
     return int(minimum)
 
 
-def _time_is_over(is_over: bool, share: Share, device: torch.device) -> bool:
+def _time_is_over(is_over: bool, share: ProcessRank, device: torch.device) -> bool:
     """Return whether the time is over in the first process: all must stop after the same epoch."""
     if share.world == 1:
         return is_over
@@ -344,13 +346,13 @@ def write_row(out: Path, row: dict[str, Any]) -> None:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
 
 
-def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
+def read_last(path: Path, recipe: Recipe, metadata: str) -> dict[str, Any] | None:
     """The state from which an interrupted training goes on.
 
     Args:
         path: The file that the training wrote.
         recipe: The recipe of this training.
-        about: Data, first weights and number of GPUs of this training.
+        metadata: Data, first weights and number of GPUs of this training.
 
     Returns:
         The state; None if there is none.
@@ -364,7 +366,7 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
         return None
     if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
         raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
-    if state.get("about", "") != about:
+    if state.get("about", "") != metadata:
         raise FormatError(
             f"{path}: of other data, other first weights or another number of GPUs; choose another folder, or delete it"
         )
@@ -372,10 +374,10 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
 
 
 def _resume(  # noqa: PLR0917
-    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, about: str
+    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, metadata: str
 ) -> tuple[int, int, float, float]:
     """Epoch and step to go on with, the time that epochs took, s, and that of the quickest."""
-    state = read_last(path, recipe, about)
+    state = read_last(path, recipe, metadata)
     if state is None:
         return 0, 0, 0.0, math.inf
     try:

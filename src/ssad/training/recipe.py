@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from ssad.core.errors import unknown_name
-from ssad.core.schema import VALUES, Above, Least, Part, Whole, checked
+from ssad.core.schema import VALUES, Above, Least, Part, Whole, build_validated
 
 FromNone = Annotated[int, Field(ge=0)]
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -52,7 +52,7 @@ class Recipe:
         jitter: Of brightness, contrast, saturation and gamma.
         noise: Largest standard deviation of added noise.
         keep: Least visible share of a box after a crop, 2D only (a 3D box stays while its middle is in sight).
-        rare: Pictures with a class that fewer than this share of them show are repeated (see `batches.repeats`); 0:
+        rare: Images with a class that fewer than this share of them show are repeated (`repetition_counts`); 0:
             none.
         validate: Epochs from one validation to the next.
         radius: Adversarial training: every picture is attacked by PGD on the training losses within this L-infinity
@@ -100,15 +100,15 @@ class Recipe:
     def _fits(self) -> Self:
         if self.zoom[0] > self.zoom[1]:
             raise ValueError("zoom: needs low <= high")
-        if self.keep and self.three:
+        if self.keep and self.is_3d:
             raise ValueError("keep: is for 2D detectors; a 3D box stays while its middle is in sight")
         for name in ("rise", "doubt"):
-            if getattr(self, name) and not self.three:
+            if getattr(self, name) and not self.is_3d:
                 raise ValueError(f"{name}: is for 3D detectors")
         return self
 
     @property
-    def three(self) -> bool:
+    def is_3d(self) -> bool:
         """True for 3D detectors."""
         return self.detector.startswith(("fcos3d", "pgd"))
 
@@ -200,17 +200,17 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    return checked(
+    return build_validated(
         partial(replace, RECIPES[name]), changes, subject=f"recipe {name}", kind=Recipe, name_field="detector"
     )
 
 
-def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:
+def command_line_changes(changes: Iterable[tuple[str, Any]]) -> list[str]:
     """Return changed values as command line arguments."""
-    return [word for key, value in changes for word in ("--set", f"{key}={_written(value)}")]
+    return [word for key, value in changes for word in ("--set", f"{key}={_compact_yaml(value)}")]
 
 
-def _written(value: Any) -> str:
+def _compact_yaml(value: Any) -> str:
     """Return a value as compact YAML."""
     if isinstance(value, tuple):
         return "[" + ",".join(map(str, value)) + "]"

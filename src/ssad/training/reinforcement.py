@@ -22,7 +22,7 @@ from ssad.core import safeio
 from ssad.core.checkpoints import WeightsCard, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
-from ssad.core.schema import VALUES, Above, Part, Whole, checked
+from ssad.core.schema import VALUES, Above, Part, Whole, build_validated
 from ssad.training.recipe import Decay, FromNone
 from ssad.world.actions import ACTIONS, CHOICES
 from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
@@ -32,7 +32,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, config=VALUES)
-class Learning:
+class PolicyRecipe:
     """Settings of a policy training: all that decides the result but the scenarios.
 
     Attributes:
@@ -85,15 +85,15 @@ class Learning:
     seed: FromNone = 0
 
 
-LEARNINGS: dict[str, Learning] = {
-    "ppo": Learning("ppo", 1_000_000),
-    "sac": Learning("sac", 256_000, batch=256, lr=7e-4, validate=64_000),
-    "td3": Learning("td3", 320_000, batch=128, lr=3e-4, gamma=0.97, validate=64_000, noise=0.15),
+POLICY_RECIPES: dict[str, PolicyRecipe] = {
+    "ppo": PolicyRecipe("ppo", 1_000_000),
+    "sac": PolicyRecipe("sac", 256_000, batch=256, lr=7e-4, validate=64_000),
+    "td3": PolicyRecipe("td3", 320_000, batch=128, lr=3e-4, gamma=0.97, validate=64_000, noise=0.15),
 }
 """How drivers are trained."""
 
 
-def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str, Any]) -> Learning:
+def find_policy_recipe(table: Mapping[str, PolicyRecipe], name: str, changes: Mapping[str, Any]) -> PolicyRecipe:
     """Return a recipe of a table by name, with changed values.
 
     Raises:
@@ -102,12 +102,12 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
-    return checked(
-        partial(replace, table[name]), changes, subject=f"training {name}", kind=Learning, name_field="algorithm"
+    return build_validated(
+        partial(replace, table[name]), changes, subject=f"training {name}", kind=PolicyRecipe, name_field="algorithm"
     )
 
 
-def require() -> Any:
+def import_sb3() -> Any:
     """Import stable-baselines3. ConfigError if it is not installed."""
     try:
         import stable_baselines3
@@ -116,72 +116,72 @@ def require() -> Any:
     return stable_baselines3
 
 
-def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
+def make_model(recipe: PolicyRecipe, env: Any, *, device: str = "cpu") -> Any:
     """Make a new stable-baselines3 model on a `VecEnv`.
 
     Args:
-        learning: The recipe.
+        recipe: The recipe.
         env: The vector environment.
         device: Device of the networks.
     """
-    sb3 = require()
-    initial_rate, final_rate = learning.lr, learning.lr / 20.0
+    sb3 = import_sb3()
+    initial_rate, final_rate = recipe.lr, recipe.lr / 20.0
 
     def rate_schedule(left: float) -> float:
         return final_rate + (initial_rate - final_rate) * left
 
     common_options: dict[str, Any] = {
         "learning_rate": rate_schedule,
-        "gamma": learning.gamma,
-        "batch_size": learning.batch,
-        "seed": learning.seed,
+        "gamma": recipe.gamma,
+        "batch_size": recipe.batch,
+        "seed": recipe.seed,
         "device": device,
     }
-    policy_options: dict[str, Any] = {"net_arch": list(learning.hidden), "activation_fn": torch.nn.ReLU}
-    if learning.algorithm == "ppo":
-        policy_options["log_std_init"] = math.log(learning.noise)
+    policy_options: dict[str, Any] = {"net_arch": list(recipe.hidden), "activation_fn": torch.nn.ReLU}
+    if recipe.algorithm == "ppo":
+        policy_options["log_std_init"] = math.log(recipe.noise)
         return sb3.PPO(
             "MlpPolicy",
             env,
-            n_steps=learning.rollout,
-            n_epochs=learning.epochs,
-            gae_lambda=learning.gae,
-            ent_coef=learning.entropy,
+            n_steps=recipe.rollout,
+            n_epochs=recipe.epochs,
+            gae_lambda=recipe.gae,
+            ent_coef=recipe.entropy,
             policy_kwargs=policy_options,
             **common_options,
         )
     off_policy_options: dict[str, Any] = {
-        "buffer_size": learning.buffer,
-        "learning_starts": learning.first,
+        "buffer_size": recipe.buffer,
+        "learning_starts": recipe.first,
         "train_freq": 1,
-        "gradient_steps": learning.updates,
+        "gradient_steps": recipe.updates,
         "policy_kwargs": policy_options,
     }
-    if learning.algorithm in ("td3", "ddpg"):
+    if recipe.algorithm in ("td3", "ddpg"):
         action_shape = env.action_space.shape
         off_policy_options["action_noise"] = sb3.common.noise.NormalActionNoise(
-            np.zeros(action_shape), np.full(action_shape, learning.noise)
+            np.zeros(action_shape), np.full(action_shape, recipe.noise)
         )
-    if learning.algorithm == "dqn":
-        if ACTIONS[learning.action] != CHOICES.shape[1]:
-            raise ConfigError(f"dqn chooses between actions of two numbers; '{learning.action}' has another number")
+    if recipe.algorithm == "dqn":
+        if ACTIONS[recipe.action] != CHOICES.shape[1]:
+            raise ConfigError(f"dqn chooses between actions of two numbers; '{recipe.action}' has another number")
         from ssad.world.sb3 import DiscreteActions
 
         env = DiscreteActions(env)
         off_policy_options |= {
             "exploration_fraction": 1 / 3,
-            "exploration_final_eps": learning.noise,
+            "exploration_final_eps": recipe.noise,
             "target_update_interval": 1_000,
         }
-    return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common_options)
+    return getattr(sb3, recipe.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common_options)
 
 
-def begin_with(model: Any, learning: Learning, folder: Path) -> str:
+def load_start_networks(model: Any, recipe: PolicyRecipe, folder: Path) -> str:
     """Load the networks of the last checkpoint of an earlier training into a new model.
 
     Args:
         model: A model from `make_model`.
-        learning: Its recipe.
+        recipe: Its recipe.
         folder: Output folder of the earlier training.
 
     Returns:
@@ -194,7 +194,7 @@ def begin_with(model: Any, learning: Learning, folder: Path) -> str:
     path = folder / LAST_CHECKPOINT
     state = read_state(path, "key")
     if state is None:
-        raise ConfigError(f"{path}: not found; start from the folder of a training with {learning.algorithm}")
+        raise ConfigError(f"{path}: not found; start from the folder of a training with {recipe.algorithm}")
     try:
         model.policy.load_state_dict(state["policy"])
     except (KeyError, RuntimeError, TypeError):
@@ -205,40 +205,40 @@ def begin_with(model: Any, learning: Learning, folder: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def export(model: Any, recipe: PolicyRecipe) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Export the policy of a model: its tensors in the format of `ssad.world.policy`, and its config.
 
     Returns:
         Tensors by name, and the part of the card's config that a policy needs.
     """
-    if learning.algorithm == "ppo":
+    if recipe.algorithm == "ppo":
         body, head, squash = model.policy.mlp_extractor.policy_net, model.policy.action_net, "clip"
-    elif learning.algorithm == "sac":
+    elif recipe.algorithm == "sac":
         body, head, squash = model.actor.latent_pi, model.actor.mu, "tanh"
-    elif learning.algorithm == "dqn":
+    elif recipe.algorithm == "dqn":
         body, head, squash = model.q_net.q_net, None, "best"
     else:
         body, head, squash = model.actor.mu, None, "tanh"
     layers = [layer for layer in [*body, head] if isinstance(layer, torch.nn.Linear)]
-    policy_config = {"observation": learning.observation, "action": learning.action, "squash": squash}
+    policy_config = {"observation": recipe.observation, "action": recipe.action, "squash": squash}
     return tensors_of(layers), policy_config
 
 
-def policy_now(model: Any, learning: Learning) -> Policy:
+def current_policy(model: Any, recipe: PolicyRecipe) -> Policy:
     """Return the current policy of a model."""
-    tensors, policy_config = export(model, learning)
-    return policy_of(WeightsCard("", "", learning.seed, (), config=policy_config), tensors, "training")
+    tensors, policy_config = export(model, recipe)
+    return policy_of(WeightsCard("", "", recipe.seed, (), config=policy_config), tensors, "training")
 
 
-def learn(
+def train_policy(
     model: Any,
-    learning: Learning,
+    recipe: PolicyRecipe,
     out: Path,
     *,
     validate: Callable[[Policy], dict[str, float]] | None = None,
     report: Say = print,
     seconds: float | None = None,
-    about: str = "",
+    metadata: str = "",
 ) -> dict[str, Any]:
     """Train a model, or go on where OUT/last.pt stopped.
 
@@ -247,12 +247,12 @@ def learn(
 
     Args:
         model: As `make_model` gives it.
-        learning: The recipe.
+        recipe: The recipe.
         out: Folder to write to.
         validate: Metrics of a policy, of which `score` says which one is best.
         report: Called with a line about progress.
         seconds: Stop after this time, s; run it again to go on.
-        about: What else the result depends on; it must be the same when the training goes on.
+        metadata: What else the result depends on; it must be the same when the training goes on.
 
     Returns:
         The state of the checkpoint: `best`, the tensors of the best policy by `score` (the last one without
@@ -263,16 +263,18 @@ def learn(
         FormatError: last.pt is of another recipe, of other scenarios, or broken.
         StoreError: A file cannot be written.
     """
-    require()
-    key = safeio.dump_json({"learning": asdict(learning), "about": about})
+    import_sb3()
+    key = safeio.dump_json({"learning": asdict(recipe), "about": metadata})
     state = _read_last(out / LAST_CHECKPOINT, key)
     if state is not None:
         _restore(model, state, out / LAST_CHECKPOINT)
-    if model.num_timesteps >= learning.steps and state is not None:
+    if model.num_timesteps >= recipe.steps and state is not None:
         return state
-    callback = _keeper(model, learning, out, key=key, state=state, validate=validate, say=report, seconds=seconds)
+    callback = _checkpoint_callback(
+        model, recipe, out, key=key, state=state, validate=validate, say=report, seconds=seconds
+    )
     try:
-        model.learn(learning.steps - model.num_timesteps, callback=callback, reset_num_timesteps=False)
+        model.learn(recipe.steps - model.num_timesteps, callback=callback, reset_num_timesteps=False)
     except ValueError as error:  # torch's distributions reject NaN
         if "Expected parameter" not in str(error):
             raise
@@ -282,7 +284,7 @@ def learn(
     return final_state
 
 
-def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
+def _checkpoint_callback(model: Any, recipe: PolicyRecipe, out: Path, **options: Any) -> Any:
     """Return the callback that validates and writes checkpoints; its base class is imported late."""
     from stable_baselines3.common.callbacks import BaseCallback
 
@@ -290,7 +292,7 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.state: dict[str, Any] = dict(options["state"] or {"best": None, "best_row": {}, "steps": 0})
-            self.next = self.state["steps"] + learning.validate
+            self.next = self.state["steps"] + recipe.validate
             self.began = time.monotonic()
             self.start = model.num_timesteps
 
@@ -318,18 +320,18 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
             if not all(bool(value.isfinite().all()) for value in model.policy.state_dict().values()):
                 self.diverged()
             steps = model.num_timesteps
-            self.next = steps + learning.validate
+            self.next = steps + recipe.validate
             if steps == self.state["steps"]:
                 return
-            tensors, _ = export(model, learning)
+            tensors, _ = export(model, recipe)
             elapsed = max(time.monotonic() - self.began, 1e-9)
             row: dict[str, Any] = {"step": steps, "steps_s": round((steps - self.start) / elapsed, 1)}
             recent_returns = [episode["r"] for episode in model.ep_info_buffer or ()]
             if recent_returns:
-                row["return"] = round(float(np.mean(recent_returns)) / learning.reward_scale, 3)
+                row["return"] = round(float(np.mean(recent_returns)) / recipe.reward_scale, 3)
             if options["validate"] is not None:
                 row |= {
-                    name: round(value, 5) for name, value in options["validate"](policy_now(model, learning)).items()
+                    name: round(value, 5) for name, value in options["validate"](current_policy(model, recipe)).items()
                 }
             best_row = self.state["best_row"]
             if self.state["best"] is None or row.get("score", 0.0) >= best_row.get("score", 0.0):
@@ -442,33 +444,33 @@ def draw_curves(out: Path) -> None:
 
 def finish(
     path: Path,
-    learning: Learning,
+    recipe: PolicyRecipe,
     model: Any,
     *,
     state: Mapping[str, Any],
     data: str,
     command: str,
     test: Callable[[Driver], dict[str, float]],
-    about: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
 ) -> str:
     """Write the best policy of a training with its card and curves; returns a line about it.
 
     Args:
         path: NAME.safetensors in the folder of the training.
-        learning: Its recipe.
+        recipe: Its recipe.
         model: The model.
         state: What `learn` returned.
         data: What it learned from, for the card.
         command: What trains it anew.
         test: Measures a driver.
-        about: What else the card says of the training.
+        metadata: What else the card says of the training.
     """
     best_row = state["best_row"]
-    recipe_values = {recipe_field.name: getattr(learning, recipe_field.name) for recipe_field in fields(learning)}
-    config = export(model, learning)[1] | recipe_values | {"steps_done": best_row["step"], **(about or {})}
-    draft_card = WeightsCard("", "", learning.seed, (), config=config)
+    recipe_values = {recipe_field.name: getattr(recipe, recipe_field.name) for recipe_field in fields(recipe)}
+    config = export(model, recipe)[1] | recipe_values | {"steps_done": best_row["step"], **(metadata or {})}
+    draft_card = WeightsCard("", "", recipe.seed, (), config=config)
     metrics = test(PolicyDriver(policy_of(draft_card, state["best"], str(path.parent)), name=path.stem))
-    card = WeightsCard(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
+    card = WeightsCard(data=data, command=command, seed=recipe.seed, classes=(), metrics=metrics, config=config)
     save_weights(path, state["best"], card=card)
     draw_curves(path.parent)
     summary = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())

@@ -13,7 +13,7 @@ from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.rotations import wrap, wrap_angle
+from ssad.core.rotations import wrap_angle, wrap_scalar
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
@@ -73,8 +73,8 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
                 raise ConfigError(f"belief: {name} must lie between -1 and {limit - 1}")
 
 
-def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of `Seen` [B, K, ...] for a validated belief.
+def complete_belief(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of `PerceivedAgents` [B, K, ...] for a validated belief.
 
     Args:
         belief: The belief [B, K].
@@ -107,7 +107,9 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     height = _lane_heights(pose, occupied, lanes) if belief.height is None else belief.height
     arrays["height"] = np.asarray(height, np.float32)
     arrays["waited"] = (
-        np.zeros(kind.shape, np.float32) if belief.stood is None else np.asarray(belief.stood, np.float32)
+        np.zeros(kind.shape, np.float32)
+        if belief.standing_time is None
+        else np.asarray(belief.standing_time, np.float32)
     )
     change = np.zeros((*kind.shape, 2), np.int32) if belief.change is None else np.asarray(belief.change, np.int32)
     arrays["change"] = change
@@ -138,11 +140,11 @@ def rest_times(
     return durations
 
 
-def _lane_heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
+def _lane_heights(pose: F32, is_used: Bool, lanes: Sequence[Lanes]) -> F32:
     """[B, K] height of the lane under each object, NaN where it is on none that goes its way; 0 without bridges."""
-    heights = np.zeros(used.shape, np.float32)
+    heights = np.zeros(is_used.shape, np.float32)
     for current_town in dict.fromkeys(town_lanes for town_lanes in lanes if town_lanes.hilly):
-        scene, row = np.nonzero(used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
+        scene, row = np.nonzero(is_used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
         lane, s, _ = current_town.match(pose[scene, row].astype(np.float64))
         heights[scene, row] = current_town.height(lane, s)
     return heights
@@ -154,7 +156,7 @@ def _infer_forecasts(  # noqa: PLR0917
     kind: I32,
     half: F32,
     gives_way: Bool,
-    used: Bool,
+    is_used: Bool,
     lanes: Sequence[Lanes],
     forecasts: F32 | None,
 ) -> tuple[F32, F32, I32]:
@@ -163,7 +165,7 @@ def _infer_forecasts(  # noqa: PLR0917
     junction_info = np.tile(np.array([FAR, FAR, float(TurnRank.STRAIGHT), 0.0], np.float32), (*kind.shape, 1))
     signal = np.full(kind.shape, -1, np.int32)
     for current_town in dict.fromkeys(lanes):
-        scene, row = np.nonzero(used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
+        scene, row = np.nonzero(is_used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
         poses, expected_speed = pose[scene, row].astype(np.float64), speed[scene, row].astype(np.float64)
         lane, s, lateral = current_town.match(poses)
         lane[kind[scene, row] == AgentKind.WALKER] = -1
@@ -190,7 +192,7 @@ class Lanes:
         self._grid = grid_of(graph, DRIVABLE)
         segments = self._grid.seg
         self._yaw = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
-        count = graph.lanes
+        count = graph.lane_count
         first_vertices, last_vertices = graph.offset[:-1], graph.offset[1:] - 1
         self._next = np.full(count, -1, np.int64)
         for lane in range(count):
@@ -198,7 +200,7 @@ class Lanes:
                 successor for successor in graph.successors(lane).tolist() if graph.kind[successor] == LaneType.DRIVING
             ]
             heading_changes = [
-                abs(wrap(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
+                abs(wrap_scalar(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
                 for successor in successors
             ]
             if successors:
@@ -230,7 +232,7 @@ class Lanes:
         distance, rank_ahead = np.where(in_junction, 0.0, FAR), np.where(in_junction, turn_rank, 0).astype(np.float64)
         successor = np.maximum(self._next, 0)
         enters_junction = ~in_junction & (self._next >= 0) & in_junction[successor]
-        signed = np.isin(np.arange(graph.lanes), graph.rule_lane)
+        signed = np.isin(np.arange(graph.lane_count), graph.rule_lane)
         # Each round looks one lane further ahead.
         for _ in range(HOPS):
             remaining = np.where(self._next >= 0, distance[successor], FAR)
@@ -272,10 +274,10 @@ class Lanes:
         cost = distance[valid] + 4.0 * (1.0 - alignment[valid])
         valid = valid[np.lexsort((segment_rows[valid], cost, owner[valid]))]
         valid = valid[np.concatenate([[True], np.diff(owner[valid]) != 0])[: len(valid)]]
-        matched = owner[valid]
-        lane[matched] = grid.seg_lane[segment_rows[valid]]
-        along[matched] = grid.seg_s[segment_rows[valid]] + share[valid] * np.sqrt(squared_length[valid])
-        lateral[matched] = np.copysign(distance[valid], dx[valid] * py[valid] - dy[valid] * px[valid])
+        matched_lanes = owner[valid]
+        lane[matched_lanes] = grid.seg_lane[segment_rows[valid]]
+        along[matched_lanes] = grid.seg_s[segment_rows[valid]] + share[valid] * np.sqrt(squared_length[valid])
+        lateral[matched_lanes] = np.copysign(distance[valid], dx[valid] * py[valid] - dy[valid] * px[valid])
         return lane, along, lateral
 
     def height(self, lane: npt.NDArray[np.int64], s: F64) -> F64:

@@ -147,12 +147,12 @@ def _check_bits(make: MakeSimulator, order: list[int], steps: int) -> None:
 
     world = _take_egos(make(order))
     _run(world, order, half_steps)
-    before = hashes(world)
+    hashes_before = hashes(world)
     world.reset([0])
     world.take(_egos(world) & (np.arange(world.batch) == 0)[:, None], Controller.EXTERNAL, policy=0)
-    after = hashes(world)
-    _require(after[0] == start_hashes[0], "resetting one scene brings back its start")
-    _require(after[1:] == before[1:], "resetting one scene leaves the others alone")
+    hashes_after = hashes(world)
+    _require(hashes_after[0] == start_hashes[0], "resetting one scene brings back its start")
+    _require(hashes_after[1:] == hashes_before[1:], "resetting one scene leaves the others alone")
 
 
 def _check_physics(world: Simulator, order: Sequence[int], steps: int) -> None:
@@ -288,9 +288,9 @@ def _check_branches(driver: Driver, world: Simulator, steps: int, sensors: Mappi
     _require(runs[0] == runs[1], "a restored snapshot continues as before")
 
 
-def _check_controls(driver: Driver, world: Simulator, steps: int, known: Mapping[str, Sensor]) -> None:
+def _check_controls(driver: Driver, world: Simulator, steps: int, known_positions: Mapping[str, Sensor]) -> None:
     """Check that the controls are in range for any number of agents, and that the driver changes no input."""
-    sensors = {name: known[name] for name in getattr(driver, "sensors", ())}
+    sensors = {name: known_positions[name] for name in getattr(driver, "sensors", ())}
     all_agents = np.argwhere(_take_egos(world).state().active).astype(np.int32)
     driver.reset([world.episodes[index] for index in world.assigned])
     for step in range(min(steps, 5)):

@@ -13,7 +13,7 @@ from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
+from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, PhaseCondition, Roads, TurnRank, array_types
 from ssad.world.kernels.shared import BRIDGE
 from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 
@@ -233,7 +233,7 @@ def _beside(route: Route, graph: LaneGraph) -> F32:
                 or marking not in (Marking.NONE, Marking.BROKEN)
             ):
                 continue
-            same_direction = graph.same_direction(lane, neighbour)
+            same_direction = graph.is_same_direction(lane, neighbour)
             if column == 2 and not same_direction:
                 continue
             distance, width = _lane_left(route, points, graph, neighbour)
@@ -329,7 +329,11 @@ def _put_agent(  # noqa: PLR0917
     a["track"][e, i] = track
     a["phase_count"][e, i] = len(agent.phases)
     for phase_index, phase in enumerate(agent.phases):
-        a["phase_when"][e, i, phase_index] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
+        a["phase_when"][e, i, phase_index] = (
+            PhaseCondition[phase.when.kind.upper()],
+            phase.when.value,
+            phase.when.actor + 1,
+        )
         a["phase_speed"][e, i, phase_index] = phase.speed
 
 
@@ -504,8 +508,8 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["beside"] = [table.beside for table in pool.tables]
     parts["ahead"] = [table.ahead for table in pool.tables]
     for name, array_type in array_types(Roads).items():
-        joined = np.concatenate(parts[name])
-        if len(joined) == 0:  # a town without signals
-            joined = np.zeros((1, *joined.shape[1:]), joined.dtype)
-        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array_type.dtype, device=device))
+        joined_tables = np.concatenate(parts[name])
+        if len(joined_tables) == 0:  # a town without signals
+            joined_tables = np.zeros((1, *joined_tables.shape[1:]), joined_tables.dtype)
+        setattr(roads, name, wp.array(np.ascontiguousarray(joined_tables), dtype=array_type.dtype, device=device))
     return roads

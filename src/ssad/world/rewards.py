@@ -21,15 +21,19 @@ Reward = Callable[[WorldState], F64]
 _ASIDE = 0.5  # m from the route that cost nothing
 
 
-def _ego_reward(state: WorldState, *, desired_speed: float, collision: float, living: float, aside: float = 0.0) -> F64:
+def _ego_reward(
+    state: WorldState, *, desired_speed: float, collision: float, step_reward: float, lateral_weight: float = 0.0
+) -> F64:
     route_point = state.roads.path[state.route[:, 0, 0] + state.route_point]
     x, y, yaw = (state.pose[:, 0] - route_point[:, :3]).T
     offset = np.cos(route_point[:, 2]) * y - np.sin(route_point[:, 2]) * x
     speed_along = state.speed[:, 0] * np.cos(yaw)
     steer = np.abs(state.control[:, 0, 2])
     reward = speed_along - collision * (state.contact != Contact.NONE) - 10.0 * (speed_along > desired_speed)
-    reward = reward - (np.abs(offset) > 4.0) - 5.0 * steer * steer - 0.2 * steer * speed_along * speed_along - living
-    reward = reward - aside * np.maximum(np.abs(offset) - _ASIDE, 0.0)
+    reward = (
+        reward - (np.abs(offset) > 4.0) - 5.0 * steer * steer - 0.2 * steer * speed_along * speed_along - step_reward
+    )
+    reward = reward - lateral_weight * np.maximum(np.abs(offset) - _ASIDE, 0.0)
     rewards: F64 = reward.astype(np.float64)
     return rewards
 
@@ -40,12 +44,12 @@ def safebench(state: WorldState) -> F64:
     -1 for a collision, + speed along the lane, -10 above 8 m/s, -1 beyond 4 m from the route, -5 steer^2, -0.2
     |steer| times the speed squared. Source: SafeBench (Xu et al. 2022), its environment's `_get_reward`.
     """
-    return _ego_reward(state, desired_speed=8.0, collision=1.0, living=0.0)
+    return _ego_reward(state, desired_speed=8.0, collision=1.0, step_reward=0.0)
 
 
 def frea(state: WorldState) -> F64:
     """Return FREA's reward of the egos, [B]: SafeBench's with -10 for a collision, 6 m/s desired, and -0.1 a step."""
-    return _ego_reward(state, desired_speed=6.0, collision=10.0, living=0.1)
+    return _ego_reward(state, desired_speed=6.0, collision=10.0, step_reward=0.1)
 
 
 def driver(state: WorldState) -> F64:
@@ -53,7 +57,7 @@ def driver(state: WorldState) -> F64:
 
     With SafeBench's -1 or FREA's -10 a contact costs what at most one or two steps bring at 8 m/s.
     """
-    return _ego_reward(state, desired_speed=8.0, collision=100.0, living=0.1) - 5.0 * state.off_road
+    return _ego_reward(state, desired_speed=8.0, collision=100.0, step_reward=0.1) - 5.0 * state.off_road
 
 
 def lane(state: WorldState) -> F64:
@@ -61,7 +65,10 @@ def lane(state: WorldState) -> F64:
 
     Without that, policies cut left turns by 2 to 3 m, into those who wait there.
     """
-    return _ego_reward(state, desired_speed=8.0, collision=100.0, living=0.1, aside=1.5) - 5.0 * state.off_road
+    return (
+        _ego_reward(state, desired_speed=8.0, collision=100.0, step_reward=0.1, lateral_weight=1.5)
+        - 5.0 * state.off_road
+    )
 
 
 REWARDS: dict[str, Reward] = {"safebench": safebench, "frea": frea, "driver": driver, "lane": lane}
@@ -104,7 +111,9 @@ def hit_others(state: WorldState, agents: I32) -> Bool:
     return touches
 
 
-def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = False, off_road: float = 0.0) -> F64:
+def adversary(
+    state: WorldState, agents: I32, previous_cost: F64, *, literal: bool = False, off_road: float = 0.0
+) -> F64:
     """Return the reward of goal-seeking adversaries (Adv.PPO), [N].
 
     clip(before - now, -1, 1) - 15 for a contact with an agent other than the ego + 15 within 2 m of the goal, as the
@@ -113,7 +122,7 @@ def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = Fa
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
-        before: [N] `distance_to_goal` before the step.
+        previous_cost: [N] `distance_to_goal` before the step.
         literal: Equation 6 as printed instead: now - before - 15 r_col - 15 r_fin with r_col = -1 and r_fin = 1.
             Its signs reward driving away and contacts, and punish reaching the goal.
         off_road: Cost of each step with its centre off the road; neither the paper nor FREA has such a term.
@@ -124,9 +133,9 @@ def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = Fa
     hit, at_goal = hit_others(state, agents), distance < GOAL_RADIUS
     road_cost = off_road * (state.lane[agents[:, 0], agents[:, 1]] < 0)
     if literal:
-        literal_reward: F64 = distance - before + 15.0 * hit - 15.0 * at_goal - road_cost
+        literal_reward: F64 = distance - previous_cost + 15.0 * hit - 15.0 * at_goal - road_cost
         return literal_reward
-    reward: F64 = np.clip(before - distance, -1.0, 1.0) - 15.0 * hit + 15.0 * at_goal - road_cost
+    reward: F64 = np.clip(previous_cost - distance, -1.0, 1.0) - 15.0 * hit + 15.0 * at_goal - road_cost
     return reward
 
 
@@ -173,7 +182,7 @@ def collision_cost(
     return costs
 
 
-def colliding(state: WorldState, agents: I32, before: F64) -> F64:
+def colliding(state: WorldState, agents: I32, previous_cost: F64) -> F64:
     """A reward of adversaries from the paper's equation 5, [N]: how much `collision_cost` fell in a step, in m.
 
     Its sum over an episode is minus the cost at the end, so an adversary is not paid for ending one early.
@@ -181,9 +190,9 @@ def colliding(state: WorldState, agents: I32, before: F64) -> F64:
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
-        before: [N] `cost_of` before the step.
+        previous_cost: [N] `cost_of` before the step.
     """
-    return before - cost_of(state, agents)
+    return previous_cost - cost_of(state, agents)
 
 
 def cost_of(state: WorldState, agents: I32) -> F64:
@@ -193,7 +202,7 @@ def cost_of(state: WorldState, agents: I32) -> F64:
     return np.asarray(collision_cost(state, mask)[agents[:, 0]])
 
 
-def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_road: float = 0.0) -> F64:
+def feasible(state: WorldState, agents: I32, previous_cost: F64, avoided: Bool, *, off_road: float = 0.0) -> F64:
     """The reward of a feasibility-guided adversary, [N]: a contact with the ego counts by who could have avoided it.
 
     A collision that nobody could avoid says nothing about the ego. So a contact is paid with 30 if a careful driver
@@ -203,7 +212,7 @@ def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
-        before: [N] `distance_to_goal` before the step.
+        previous_cost: [N] `distance_to_goal` before the step.
         avoided: [N] whether a careful driver in the ego's place would have stayed clear; of those who touch the ego.
         off_road: As of `adversary`.
 
@@ -211,7 +220,7 @@ def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_
     turns the adversary back where there is none; here the encounter is judged when it is over.
     """
     scene, agent = agents.T
-    progress = np.clip(before - distance_to_goal(state, agents), -1.0, 1.0)
+    progress = np.clip(previous_cost - distance_to_goal(state, agents), -1.0, 1.0)
     contact = np.where(hit_ego(state, agents), np.where(avoided, 30.0, -10.0), 0.0)
     reward: F64 = (
         0.3 * progress - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)

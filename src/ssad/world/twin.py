@@ -139,15 +139,15 @@ def unroll(
     controls = controls.reshape(steps, *[1] * (len(shape) - len(control_shape)), *control_shape, width).expand(
         steps, *shape, width
     )
-    driven = _drive(state, controls, bodies, dt / substeps, substeps)
+    states = _drive(state, controls, bodies, dt / substeps, substeps)
     if not bool(bodies.walker.any()):  # Skip the walkers' half of the work where there is none.
-        return driven
+        return states
     walked = _walk(state, controls, bodies, dt)
     walker = bodies.walker
     return MotionState(
-        torch.where(walker[..., None], walked.pose, driven.pose),
-        torch.where(walker, walked.speed, driven.speed),
-        torch.where(walker, walked.wheel, driven.wheel),
+        torch.where(walker[..., None], walked.pose, states.pose),
+        torch.where(walker, walked.speed, states.speed),
+        torch.where(walker, walked.wheel, states.wheel),
     )
 
 
@@ -166,8 +166,8 @@ def box_gap(first: Tensor, second: Tensor) -> Tensor:
     """
     first, second = _broadcast(first, second)
     first_corners, second_corners = _corners(first), _corners(second)
-    outside_one, depth_one = _beside(_to_local(first, second_corners), 0.5 * first[..., None, 3:5])
-    outside_two, depth_two = _beside(_to_local(second, first_corners), 0.5 * second[..., None, 3:5])
+    outside_one, depth_one = _signed_distance_from_box(_to_local(first, second_corners), 0.5 * first[..., None, 3:5])
+    outside_two, depth_two = _signed_distance_from_box(_to_local(second, first_corners), 0.5 * second[..., None, 3:5])
     depth = torch.maximum(depth_one, depth_two)
     return torch.where(depth > 0.0, torch.minimum(outside_one, outside_two), depth)
 
@@ -353,7 +353,7 @@ def _to_local(boxes: Tensor, points: Tensor) -> Tensor:
     return rotate(points - boxes[..., None, :2], -boxes[..., 2:3])
 
 
-def _beside(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+def _signed_distance_from_box(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     """Return how far points [..., n, 2] are from a box of half extents [..., 1, 2] at the origin.
 
     Returns:

@@ -15,26 +15,26 @@ import warp as wp
 from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
-from ssad.world.belief import Lanes, check, complete, lanes_of, rest_times
+from ssad.world.belief import Lanes, check, complete_belief, lanes_of, rest_times
 from ssad.world.episode_arrays import build
-from ssad.world.kernels.belief import see
-from ssad.world.kernels.data import BLOCK, HORIZON, Ego, Presence, Seen, State, Work, array_types
+from ssad.world.kernels.belief import fill_all_rows
+from ssad.world.kernels.data import BLOCK, HORIZON, Ego, PerceivedAgents, Presence, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
-from ssad.world.kernels.noise import calm, chance
+from ssad.world.kernels.noise import advance_noise, reset_noise
 from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
-from ssad.world.kernels.traffic import meet, sight
+from ssad.world.kernels.traffic import react_to_agents, scan_all_agents
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
-_STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
-# The remaining arrays of `Seen` have one row per object, so a growing belief resizes them.
-_OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `Seen` that have no rows of objects
+_STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
+# The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
+_OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class World:
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
-        quiet_warp()
+        start_warp_quietly()
         self.episodes = tuple(episodes)
         self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt
@@ -96,13 +96,13 @@ class World:
         # A pair of agents is stored as one int32 code, with two more bits for its flags.
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
-        self.believed = 0  # room for objects of a belief in each scene
+        self.belief_capacity = 0  # room for objects of a belief in each scene
         self._views: dict[str, npt.NDArray[Any]] = {}
         self.arrays = State()
         shape = (self.batch, self.agents, HORIZON)
         for name, array_type in _STATE.items():
             setattr(self.arrays, name, wp.zeros(shape[: array_type.ndim], dtype=array_type.dtype, device=device))
-        self.seen = Seen()
+        self.seen = PerceivedAgents()
         self._lanes: dict[str, Lanes] = {}
         self.ego = Ego()
         for name, array_type in _EGO.items():
@@ -127,8 +127,8 @@ class World:
         row_count = self.agents + believed
         if self.batch * self.agents * row_count >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents and {believed} objects are too many")
-        previous_arrays = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.believed else {}
-        self.believed = believed
+        previous_arrays = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.belief_capacity else {}
+        self.belief_capacity = believed
         for name, array_type in _SEEN.items():
             shape = {
                 "believes": (self.batch,),
@@ -157,7 +157,7 @@ class World:
             noise_reset = []
             if self.chance is not None:
                 noise_inputs = [state, self.noise, self._mask, ended_too, self.agents, self.chance.stretches]
-                noise_reset = [self.launch(calm, self.batch, noise_inputs)]
+                noise_reset = [self.launch(reset_noise, self.batch, noise_inputs)]
             return [
                 *noise_reset,
                 self.launch(
@@ -169,17 +169,21 @@ class World:
             ]
 
         self._restart = restarts(0)
-        self._see = self.launch(see, launch_shape, [bank, roads, state, perceived, self.agents, agent_threads, dt])
+        self._see = self.launch(
+            fill_all_rows, launch_shape, [bank, roads, state, perceived, self.agents, agent_threads, dt]
+        )
         self._plan = [
             *(restarts(1) if autoreset else []),
             self._see,
             self.launch(
-                sight,
+                scan_all_agents,
                 launch_shape,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, agent_threads, dt],
             ),
             self.launch(
-                meet, pair_threads, [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt]
+                react_to_agents,
+                pair_threads,
+                [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
             ),
             self.launch(
                 change_lanes,
@@ -192,7 +196,7 @@ class World:
         ]
         if self.chance is not None:
             noise_inputs = [bank, roads, state, self.chance.rule(dt), self.noise, self.agents, agent_threads]
-            self._plan.append(self.launch(chance, launch_shape, noise_inputs))
+            self._plan.append(self.launch(advance_noise, launch_shape, noise_inputs))
         self._advance = [
             self.launch(
                 move,
@@ -216,7 +220,7 @@ class World:
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """Record a launch, so that its arguments are packed only once."""
         # `meet` is faster in blocks of 256, the default; `sight` is in the same module, which is compiled for one size
-        block_size = None if self.device == "cpu" or kernel in (sight, meet) else BLOCK
+        block_size = None if self.device == "cpu" or kernel in (scan_all_agents, react_to_agents) else BLOCK
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_size, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:
@@ -434,9 +438,12 @@ class World:
 
     def remove(self, agents: Bool) -> None:
         """Remove agents [B, A] from their scenes until these restart, including agents that follow a trajectory."""
-        removed, controller = np.asarray(agents, bool), self.array("controller")
-        on_trajectory = removed & (controller == Controller.TRAJECTORY)  # would be back in the next step
-        for name, mask, value in (("active", removed, Presence.ABSENT), ("controller", on_trajectory, Controller.NONE)):
+        is_removed, controller = np.asarray(agents, bool), self.array("controller")
+        on_trajectory = is_removed & (controller == Controller.TRAJECTORY)  # would be back in the next step
+        for name, mask, value in (
+            ("active", is_removed, Presence.ABSENT),
+            ("controller", on_trajectory, Controller.NONE),
+        ):
             current = self.array(name)
             self.put(name, np.where(mask, int(value), current).astype(current.dtype))
 
@@ -473,9 +480,9 @@ class World:
             current_signals = self.array("seen.light")
             check(belief, self.batch, current_signals.shape[1], scene_mask)
             towns = [self.episodes[index].town for index in self.array("episode")]
-            belief_arrays = complete(belief, lanes_of(self.graphs, towns, self._lanes), scene_mask)
+            belief_arrays = complete_belief(belief, lanes_of(self.graphs, towns, self._lanes), scene_mask)
             step = self.array("step")
-            if belief.stood is None:
+            if belief.standing_time is None:
                 previous = {
                     name: self.array(f"seen.{name}")[:, self.agents :] for name in ("pose", "speed", "kind", "waited")
                 }
@@ -484,7 +491,7 @@ class World:
                     belief_arrays, previous, self.dt * (step - self.array("seen.told"))
                 )
             object_count = belief_arrays["kind"].shape[1]
-            if object_count > self.believed:
+            if object_count > self.belief_capacity:
                 # Round up, so that a slowly growing belief does not record the launches again each time.
                 self._make_room(-(-object_count // 16) * 16)
             for name, value in belief_arrays.items():
@@ -529,7 +536,7 @@ class World:
             forecast=agent_arrays["forecast"],
             way=agent_arrays["way"],
             line_signal=agent_arrays["signal"],
-            stood=agent_arrays["waited"],
+            standing_time=agent_arrays["waited"],
             gives_way=agent_arrays["gives_way"] != 0,
             change=agent_arrays["change"],
             height=agent_arrays["height"],
@@ -599,19 +606,19 @@ class World:
         if any(name.startswith("noise.") for name in snapshot.arrays) != bool(self._noisy):
             raise ConfigError("snapshot does not fit this world: only one of them has noise")
         saved_rows = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
-        if saved_rows > self.believed:
+        if saved_rows > self.belief_capacity:
             self._make_room(saved_rows)
         for name, value in snapshot.arrays.items():
             current = self.array(name)
-            restored = value
+            arrays = value
             if name.startswith("seen.") and value.ndim > 1 and current.shape[1] > value.shape[1]:
-                restored = current.copy()  # there is more room by now
-                restored[:, : value.shape[1]] = value
+                arrays = current.copy()  # there is more room by now
+                arrays[:, : value.shape[1]] = value
                 if name == "seen.kind":
-                    restored[:, value.shape[1] :] = AgentKind.NONE
-            if current.shape != restored.shape:
+                    arrays[:, value.shape[1] :] = AgentKind.NONE
+            if current.shape != arrays.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
-            self.put(name, restored)
+            self.put(name, arrays)
         if "seen.believes" not in snapshot.arrays:
             self.put("seen.believes", np.zeros(self.batch, np.int32))
         self._forget()

@@ -12,7 +12,7 @@ from helpers.devkit_sets import SPLIT, VERSION, make_set, write_set
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES
 from ssad.datasets.nuscenes import results as module
-from ssad.datasets.nuscenes.results import read_results, with_ego
+from ssad.datasets.nuscenes.results import add_ego_distance, read_results
 from ssad.datasets.nuscenes.score import score_results
 from ssad.datasets.nuscenes.splits import official_splits, scenes_of_split
 from ssad.datasets.nuscenes.truth import read_truth
@@ -308,4 +308,4 @@ def test_score_results_names_the_file(tmp_path: Path) -> None:
 
 
 def test_with_ego() -> None:
-    assert with_ego(BoxTable.empty(1), np.array([[3.0, 4.0, 100.0]])).ego_distance.tolist() == [5.0]
+    assert add_ego_distance(BoxTable.empty(1), np.array([[3.0, 4.0, 100.0]])).ego_distance.tolist() == [5.0]

@@ -546,7 +546,7 @@ def test_doubt_lowers_the_centreness_of_places_that_err_about_depth(config: Mono
     detector, truth = lively(config), some_truth(4)
     dense = detector.dense(pictures(1, 3, *SIZE), K[None])
     assignment = detector.assign(dense, [truth])
-    doubted = detector.doubted(dense, assignment, doubt=3.0)
+    doubted = detector.discount_centreness(dense, assignment, doubt=3.0)
     own = assignment.label[0] >= 0
     assert own.any()
     flat = flatten({name: maps for name, maps in dense.maps.items() if name != "intrinsic"})

@@ -18,10 +18,10 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.traces import trace_hash
 from ssad.core.types import AgentKind, Episode, EpisodeLimits
-from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
+from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent
+from ssad.drivers.perceiving.perceivers import CameraPerceiver, PerfectPerceiver
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
-from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
+from ssad.drivers.perceiving.tracker import TrackerSettings, tracking_settings
 from ssad.simulators.closed_loop import system_version
 from ssad.world.rollout import Loop
 
@@ -84,7 +84,7 @@ class OneCar:
         return found
 
 
-def seeing(times: list[float], driver: Perceiving, picture: Callable[[float], int]) -> list[int]:
+def seeing(times: list[float], driver: PerceivingDriver, picture: Callable[[float], int]) -> list[int]:
     """How many objects are believed at each time, where the camera shows one value everywhere."""
     driver.reset([None])  # type: ignore[list-item]
     counts = []
@@ -110,7 +110,7 @@ def test_it_looks_at_its_rate_and_nothing_is_rendered_in_between() -> None:
         calls.append(float(simulator.state().time[0]))
         return np.full((len(agents), 3, CAMERA.height, CAMERA.width), 9, np.uint8)
 
-    driver = Perceiving(CameraEyes(OneCar(), {"front": CAMERA}), rate=2.5)
+    driver = PerceivingDriver(CameraPerceiver(OneCar(), {"front": CAMERA}), rate=2.5)
     run(driver, made, town, sensors={"front": camera})
     np.testing.assert_allclose(calls, [0.0, 0.4, 0.8, 1.2, 1.6], atol=1e-5)
 
@@ -118,8 +118,8 @@ def test_it_looks_at_its_rate_and_nothing_is_rendered_in_between() -> None:
 def test_a_car_is_believed_after_its_hits_and_the_latency_and_where_it_is() -> None:
     times = [0.1 * k for k in range(8)]
     for confirm, latency, first in ((1, 0.0, 0), (3, 0.0, 4), (1, 0.3, 3), (2, 0.1, 3)):
-        eyes = CameraEyes(OneCar(), {"front": CAMERA})
-        driver = Perceiving(eyes, rate=5.0, latency=latency, tracking=Tracking(confirm=confirm))
+        eyes = CameraPerceiver(OneCar(), {"front": CAMERA})
+        driver = PerceivingDriver(eyes, rate=5.0, latency=latency, tracking=TrackerSettings(confirm=confirm))
         counts = seeing(times, driver, lambda _: 200)
         assert counts.index(1) == first
     belief = driver.believe(steady_view(0.8, front=np.zeros((1, 3, CAMERA.height, CAMERA.width), np.uint8)))
@@ -129,8 +129,8 @@ def test_a_car_is_believed_after_its_hits_and_the_latency_and_where_it_is() -> N
 def test_a_dark_picture_is_a_miss_and_a_lost_signal_is_not() -> None:
     times = [0.2 * k for k in range(12)]
     for value, left in ((1, 0), (0, 1)):
-        eyes = CameraEyes(OneCar(), {"front": CAMERA})
-        driver = Perceiving(eyes, rate=5.0, latency=0.0, tracking=Tracking(confirm=1, reserve=3))
+        eyes = CameraPerceiver(OneCar(), {"front": CAMERA})
+        driver = PerceivingDriver(eyes, rate=5.0, latency=0.0, tracking=TrackerSettings(confirm=1, reserve=3))
         counts = seeing(times, driver, lambda time, value=value: 200 if time < 0.5 else value)  # type: ignore[misc]
         assert counts[2] == 1
         assert counts[-1] == left
@@ -139,8 +139,8 @@ def test_a_dark_picture_is_a_miss_and_a_lost_signal_is_not() -> None:
 def test_its_scenes_do_not_depend_on_their_batch_and_runs_are_equal_to_the_bit() -> None:
     made, town = episodes("TurningObstacle", count=2, steps=24)
 
-    def driver() -> Perceiving:
-        return Perceiving(PerfectEyes(missed=0.4, noise=0.05, phantoms=0.3))
+    def driver() -> PerceivingDriver:
+        return PerceivingDriver(PerfectPerceiver(missed=0.4, noise=0.05, phantoms=0.3))
 
     together = [trace_hash(trace) for trace in run(driver(), made, town)]
     assert [trace_hash(trace) for trace in run(driver(), made, town)] == together
@@ -149,7 +149,7 @@ def test_its_scenes_do_not_depend_on_their_batch_and_runs_are_equal_to_the_bit()
 
 def test_with_snapshots_of_world_and_driver_it_goes_on_to_the_bit() -> None:
     made, town = episodes(count=2, steps=40)
-    driver = Perceiving(PerfectEyes(missed=0.3, noise=0.05, phantoms=0.3), latency=0.15)
+    driver = PerceivingDriver(PerfectPerceiver(missed=0.3, noise=0.05, phantoms=0.3), latency=0.15)
     loop = Loop(World(made, {town.name: town}), {0: driver})
     loop.reset()
     for _ in range(13):
@@ -170,7 +170,7 @@ def test_missed_and_phantom_objects_are_missed_and_there() -> None:
     counts = {}
     for name, change in (("none", {}), ("missed", {"missed": 0.5, "burst": 2.0}), ("phantoms", {"phantoms": 1.0})):
         told: list[Any] = []
-        run(Perceiving(PerfectEyes(**change), watch=told.append), made, town)  # type: ignore[arg-type]
+        run(PerceivingDriver(PerfectPerceiver(**change), watch=told.append), made, town)  # type: ignore[arg-type]
         seen = [one for one in told if isinstance(one, PerceptionEvent)]
         counts[name] = float(np.mean([len(one.objects) for one in seen[:20] if one.objects is not None]))
     assert counts["missed"] < counts["none"] < counts["phantoms"]
@@ -186,7 +186,7 @@ def test_a_detector_that_returns_nonsense_fails_with_a_line(field: str) -> None:
     def camera(simulator: Any, agents: Any) -> Any:
         return np.full((len(agents), 3, CAMERA.height, CAMERA.width), 200, np.uint8)
 
-    driver = Perceiving(CameraEyes(OneCar(spoilt), {"front": CAMERA}))
+    driver = PerceivingDriver(CameraPerceiver(OneCar(spoilt), {"front": CAMERA}))
     with pytest.raises(ConfigError, match="the detector returned"):
         run(driver, made, town, sensors={"front": camera})
 
@@ -214,10 +214,10 @@ def test_what_is_read_after_the_step_is_a_line() -> None:
 
 def test_settings_out_of_range_are_one_line() -> None:
     with pytest.raises(ConfigError, match="rate above 0"):
-        Perceiving(PerfectEyes(), rate=0.0)
+        PerceivingDriver(PerfectPerceiver(), rate=0.0)
     with pytest.raises(ConfigError, match="missed in"):
-        PerfectEyes(missed=1.0)
-    eyes = CameraEyes(OneCar(), {"front": CAMERA})
+        PerfectPerceiver(missed=1.0)
+    eyes = CameraPerceiver(OneCar(), {"front": CAMERA})
     with pytest.raises(ConfigError, match="expected"):
         eyes.perceive(steady_view(0.0, front=np.ones((1, 3, 5, 5), np.uint8)), np.array([0]))
 
@@ -236,9 +236,9 @@ def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path
 def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type[OneCamera]) -> None:
     for made, low in (
         (system(), tracking_settings(system.weights).low),
-        (system(tracking=Tracking(high=0.5, low=0.2)), 0.2),
+        (system(tracking=TrackerSettings(high=0.5, low=0.2)), 0.2),
     ):
-        assert isinstance(made.perceiver, CameraEyes)
+        assert isinstance(made.perceiver, CameraPerceiver)
         assert made.perceiver.threshold == made.tracking.low == low
     scores = [tracking_settings(system.weights).high for system in (PgdDet, Fcos3d, Yolov5n)]
     assert scores == sorted(set(scores))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from ssad.drivers.perceiving.kalman import distance, predict, update
+from ssad.drivers.perceiving.kalman import predict, squared_distances, update
 
 SPREAD = np.array([[0.5, 0.2], [0.2, 0.3]])
 
@@ -55,7 +55,9 @@ def test_a_step_can_be_cut_in_two() -> None:
 
 def test_distances_are_mahalanobis() -> None:
     covariance = np.zeros((1, 4, 4))
-    found = distance(np.array([[1.0, 0.0, 9.0, 9.0]]), covariance, np.array([[3.0, 0.0]]), np.diag([4.0, 1.0])[None])
+    found = squared_distances(
+        np.array([[1.0, 0.0, 9.0, 9.0]]), covariance, np.array([[3.0, 0.0]]), np.diag([4.0, 1.0])[None]
+    )
     np.testing.assert_allclose(found, [1.0])
     draws = np.random.default_rng(3)
     mean, place = draws.normal(size=(20, 4)), draws.normal(size=(20, 2))
@@ -63,4 +65,4 @@ def test_distances_are_mahalanobis() -> None:
     covariance, spread = wide @ wide.transpose(0, 2, 1), np.tile(np.eye(2), (20, 1, 1))
     apart = place - mean[:, :2]
     expected = [d @ np.linalg.inv(c[:2, :2] + s) @ d for d, c, s in zip(apart, covariance, spread, strict=True)]
-    np.testing.assert_allclose(distance(mean, covariance, place, spread), expected, rtol=1e-9)
+    np.testing.assert_allclose(squared_distances(mean, covariance, place, spread), expected, rtol=1e-9)

@@ -16,9 +16,9 @@ from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, AgentKind
-from ssad.drivers.perceiving.eyes import object_boxes, project_boxes
 from ssad.drivers.perceiving.lift import Lifting, lift, merge_duplicates
 from ssad.drivers.perceiving.objects import KINDS, SIZES
+from ssad.drivers.perceiving.perceivers import object_boxes, project_boxes
 from ssad.rendering.camera.rig import RIG, rig_camera
 
 EGO = (120.0, -35.0, 2.1)
@@ -101,8 +101,8 @@ def test_places_are_less_sure_along_the_line_of_sight() -> None:
     line = np.array([np.cos(EGO[2]), np.sin(EGO[2])])
     side = np.array([-line[1], line[0]])
     away = 30.0 - 1.7
-    assert line @ found.spread[0] @ line == pytest.approx((0.4 + 0.05 * away) ** 2, rel=0.01)
-    assert side @ found.spread[0] @ side == pytest.approx((0.2 + 0.01 * away) ** 2, rel=0.05)
+    assert line @ found.covariance[0] @ line == pytest.approx((0.4 + 0.05 * away) ** 2, rel=0.01)
+    assert side @ found.covariance[0] @ side == pytest.approx((0.2 + 0.01 * away) ** 2, rel=0.05)
 
 
 @pytest.mark.parametrize("field", ["score", "centre"])

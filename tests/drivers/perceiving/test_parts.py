@@ -15,8 +15,7 @@ from ssad.core.driving import Believer, Observation
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeLimits
 from ssad.drivers.perceiving.check import PartCheckError, check_perceiver, check_planner, check_tracker
-from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
+from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent
 from ssad.drivers.perceiving.parts import (
     make_perceiver,
     make_planner,
@@ -24,8 +23,9 @@ from ssad.drivers.perceiving.parts import (
     part_names,
     part_version,
 )
+from ssad.drivers.perceiving.perceivers import CameraPerceiver, PerfectPerceiver
 from ssad.drivers.perceiving.signs import SignReading
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, TrackerSettings
 from ssad.simulators.closed_loop import system_version
 from ssad.world.rollout import Loop
 
@@ -82,8 +82,8 @@ class Given:
         return self.give(view, rows)
 
 
-def driver_of(give: Callable[[Any, Any], Any], **settings: Any) -> Perceiving:
-    driver = Perceiving(Given(give), latency=0.0, **({"tracking": Tracking(confirm=1)} | settings))
+def driver_of(give: Callable[[Any, Any], Any], **settings: Any) -> PerceivingDriver:
+    driver = PerceivingDriver(Given(give), latency=0.0, **({"tracking": TrackerSettings(confirm=1)} | settings))
     driver.reset([None, None])  # type: ignore[list-item]
     return driver
 
@@ -100,11 +100,13 @@ def test_boxes_are_believed_where_they_are_from_each_ego() -> None:
 
 def test_the_covariance_and_the_velocity_of_boxes_turn_with_the_ego() -> None:
     told: list[Any] = []
-    given = replace(boxes((10.0, 0.0)), spread=np.array([[[4.0, 0.0], [0.0, 1.0]]]), velocity=np.array([[3.0, 0.0]]))
+    given = replace(
+        boxes((10.0, 0.0)), covariance=np.array([[[4.0, 0.0], [0.0, 1.0]]]), velocity=np.array([[3.0, 0.0]])
+    )
     driver = driver_of(lambda view, rows: [given], watch=told.append)
     driver.believe(view_at(0.0, (0.0, 0.0, np.pi / 2)))
     found = next(event.objects for event in told if isinstance(event, PerceptionEvent))
-    np.testing.assert_allclose(found.spread[0], [[1.0, 0.0], [0.0, 4.0]], atol=1e-6)
+    np.testing.assert_allclose(found.covariance[0], [[1.0, 0.0], [0.0, 4.0]], atol=1e-6)
     np.testing.assert_allclose(found.velocity[0], [0.0, 3.0], atol=1e-6)
     nearer, farther = (
         driver_of(lambda view, rows, x=x: [boxes((x, 0.0))], watch=told.append)  # type: ignore[misc]
@@ -112,7 +114,7 @@ def test_the_covariance_and_the_velocity_of_boxes_turn_with_the_ego() -> None:
     )
     nearer.believe(view_at(0.0, (0.0, 0.0, 0.0)))
     farther.believe(view_at(0.0, (0.0, 0.0, 0.0)))
-    near, far = (event.objects.spread[0] for event in told[-4:] if isinstance(event, PerceptionEvent))
+    near, far = (event.objects.covariance[0] for event in told[-4:] if isinstance(event, PerceptionEvent))
     assert far[0, 0] > 4.0 * near[0, 0] > 0.0
 
 
@@ -125,7 +127,7 @@ def test_no_reading_is_not_an_empty_scene() -> None:
     for absent, left in ((None, 1), (boxes(), 0)):
         driver = driver_of(
             lambda view, rows, absent=absent: [boxes((10.0, 0.0)) if view.time[0] < 0.5 else absent],  # type: ignore[misc]
-            tracking=Tracking(confirm=1, reserve=2),
+            tracking=TrackerSettings(confirm=1, reserve=2),
         )
         counts = [
             int((driver.believe(view_at(0.2 * k, (0.0, 0.0, 0.0))).kind != AgentKind.NONE).sum()) for k in range(10)
@@ -176,10 +178,10 @@ def test_percepts_that_are_wrong_are_one_line(give: Any, words: str) -> None:
 
 
 def test_a_tracker_of_another_author_is_believed(episodes: list[Episode], simulator: Any) -> None:
-    driver = Perceiving(PerfectEyes(), tracker=Last(), latency=0.0)
+    driver = PerceivingDriver(PerfectPerceiver(), tracker=Last(), latency=0.0)
     traces = rollout(simulator([0, 1]), driver)
     assert all(trace.end != "collision" for trace in traces)
-    blind = Perceiving(PerfectEyes(), tracker=Last(least=2.0), latency=0.0)
+    blind = PerceivingDriver(PerfectPerceiver(), tracker=Last(least=2.0), latency=0.0)
     assert any(trace.end == "collision" for trace in rollout(simulator([0, 1]), blind))
 
 
@@ -203,20 +205,20 @@ def test_tracks_that_are_wrong_are_one_line() -> None:
 
 
 def test_a_planner_of_another_author_drives(simulator: Any) -> None:
-    driver = Perceiving(PerfectEyes(), planner=Brake(), rate=10.0, latency=0.0)
+    driver = PerceivingDriver(PerfectPerceiver(), planner=Brake(), rate=10.0, latency=0.0)
     assert driver.controller == Controller.EXTERNAL
     assert not isinstance(driver, Believer)
-    assert isinstance(Perceiving(PerfectEyes()), Believer)
+    assert isinstance(PerceivingDriver(PerfectPerceiver()), Believer)
     (trace,) = rollout(simulator([0]), driver)
     assert trace.brake.max() == 1.0  # for the car ahead
     assert trace.end != "collision"
-    (reckless,) = rollout(simulator([0]), Perceiving(PerfectEyes(), planner=Brake(distance=0.0)))
+    (reckless,) = rollout(simulator([0]), PerceivingDriver(PerfectPerceiver(), planner=Brake(distance=0.0)))
     assert reckless.end == "collision"
     assert reckless.brake.max() == 0.0
 
 
 def test_parts_without_snapshots_go_on_to_the_bit(simulator: Any) -> None:
-    driver = Perceiving(PerfectEyes(missed=0.3), tracker=Last(), planner=Brake(), latency=0.15)
+    driver = PerceivingDriver(PerfectPerceiver(missed=0.3), tracker=Last(), planner=Brake(), latency=0.15)
     loop = Loop(simulator([0, 1]), {0: driver})
     loop.reset()
     for _ in range(9):
@@ -234,9 +236,9 @@ def test_parts_without_snapshots_go_on_to_the_bit(simulator: Any) -> None:
 
 def test_parts_have_names_and_arguments() -> None:
     assert {"camera", "truth"} <= set(part_names("perceiver"))
-    assert isinstance(make_perceiver("truth", missed=0.2), PerfectEyes)
+    assert isinstance(make_perceiver("truth", missed=0.2), PerfectPerceiver)
     eyes = make_perceiver("camera", detector="yolov5n", cameras=["CAM_BACK"], width=64)
-    assert isinstance(eyes, CameraEyes)
+    assert isinstance(eyes, CameraPerceiver)
     assert (eyes.sensors, eyes.threshold, eyes.detector.name) == (("CAM_BACK",), 0.1, "yolov5n")
     tracker = make_tracker("kalman", confirm=4)
     assert isinstance(tracker, KalmanTracker)
@@ -272,7 +274,7 @@ def test_parts_that_cannot_be_made_are_one_line(make: Callable[[], Any], words: 
 
 def test_a_tracker_and_settings_of_the_built_in_one_exclude_each_other() -> None:
     with pytest.raises(ConfigError, match="not both"):
-        Perceiving(PerfectEyes(), tracker=Last(), tracking=Tracking())
+        PerceivingDriver(PerfectPerceiver(), tracker=Last(), tracking=TrackerSettings())
 
 
 def test_the_source_the_files_and_the_weights_of_a_part_are_its_version(
@@ -320,7 +322,7 @@ def test_a_system_of_named_parts_drives_in_every_suite(episodes: list[Episode], 
 # ---------------------------------------------------------------- checks
 
 
-class Far(PerfectEyes):
+class Far(PerfectPerceiver):
     def __init__(self, **settings: Any) -> None:
         super().__init__(reach=100.0, **settings)
 
@@ -381,7 +383,7 @@ class Senseless(Ahead):
         (Spoiling, "it changes nothing that it is given"),
         (NotFinite, "as its protocol says: .*centre holds a number"),
         (Senseless, "it reads a sensor"),
-        (lambda: PerfectEyes(reach=5.0), "an object is detected"),
+        (lambda: PerfectPerceiver(reach=5.0), "an object is detected"),
         (Last, "it has the methods and attributes"),
     ],
 )
@@ -448,7 +450,7 @@ class Sharing(KalmanTracker):
 
     def reset(self, episodes: Any) -> None:
         super().reset(episodes)
-        self.settings = Tracking(confirm=len(episodes))
+        self.settings = TrackerSettings(confirm=len(episodes))
 
 
 class Twins(KalmanTracker):

@@ -10,7 +10,7 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.core.perception import Objects, no_objects
 from ssad.core.types import AgentKind
-from ssad.drivers.perceiving.tracker import KalmanTracker, KalmanTracks, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, KalmanTracks, TrackerSettings
 from ssad.drivers.perceiving.tracks import belief_from_tracks
 
 STEP = 0.2
@@ -39,7 +39,7 @@ def idents(tracker: KalmanTracker) -> list[int]:
 
 
 def test_those_whose_ways_cross_keep_their_identities() -> None:
-    tracker = KalmanTracker(Tracking(confirm=2))
+    tracker = KalmanTracker(TrackerSettings(confirm=2))
     rng = np.random.default_rng(1)
     for k in range(30):
         t = k * STEP
@@ -59,7 +59,7 @@ def test_those_whose_ways_cross_keep_their_identities() -> None:
 
 @pytest.mark.parametrize("hits", [1, 2, 4])
 def test_a_track_is_believed_from_its_last_hit_to_confirm(hits: int) -> None:
-    tracker = KalmanTracker(Tracking(confirm=hits))
+    tracker = KalmanTracker(TrackerSettings(confirm=hits))
     for k in range(6):
         look(tracker, k, objects((10.0, 0.0)))
         assert len(tracker.confirmed(np.array([0]), np.array([k * STEP]))) == int(k + 1 >= hits)
@@ -67,7 +67,7 @@ def test_a_track_is_believed_from_its_last_hit_to_confirm(hits: int) -> None:
 
 @pytest.mark.parametrize("reserve", [0, 1, 3])
 def test_a_track_outlives_as_many_looks_without_a_hit_as_its_reserve(reserve: int) -> None:
-    tracker = KalmanTracker(Tracking(confirm=2, reserve=reserve))
+    tracker = KalmanTracker(TrackerSettings(confirm=2, reserve=reserve))
     look(tracker, 0, objects((10.0, 0.0)))
     look(tracker, 1, objects((10.0, 0.0)))
     for miss in range(1, 6):
@@ -76,7 +76,7 @@ def test_a_track_outlives_as_many_looks_without_a_hit_as_its_reserve(reserve: in
 
 
 def test_a_track_that_was_never_confirmed_is_soon_gone() -> None:
-    tracker = KalmanTracker(Tracking(confirm=3, reserve=10, patience=1))
+    tracker = KalmanTracker(TrackerSettings(confirm=3, reserve=10, patience=1))
     look(tracker, 0, objects((10.0, 0.0)))
     look(tracker, 1, no_objects())
     assert len(tracker.tracks) == 1
@@ -85,7 +85,7 @@ def test_a_track_that_was_never_confirmed_is_soon_gone() -> None:
 
 
 def test_a_low_score_keeps_a_track_but_begins_none() -> None:
-    tracker = KalmanTracker(Tracking(confirm=2, reserve=0, high=0.3, low=0.1))
+    tracker = KalmanTracker(TrackerSettings(confirm=2, reserve=0, high=0.3, low=0.1))
     look(tracker, 0, objects((10.0, 0.0), score=0.2))
     assert len(tracker.tracks) == 0
     look(tracker, 1, objects((10.0, 0.0)))
@@ -97,7 +97,7 @@ def test_a_low_score_keeps_a_track_but_begins_none() -> None:
 
 
 def test_a_high_score_is_matched_before_a_nearer_low_one() -> None:
-    tracker = KalmanTracker(Tracking(confirm=1))
+    tracker = KalmanTracker(TrackerSettings(confirm=1))
     look(tracker, 0, objects((10.0, 0.0)))
     both = Objects.cat([objects((10.05, 0.0), score=0.2), objects((10.4, 0.0), score=0.9)])
     look(tracker, 1, both)
@@ -105,7 +105,7 @@ def test_a_high_score_is_matched_before_a_nearer_low_one() -> None:
 
 
 def test_what_is_too_far_away_is_somebody_else() -> None:
-    tracker = KalmanTracker(Tracking(confirm=1))
+    tracker = KalmanTracker(TrackerSettings(confirm=1))
     look(tracker, 0, objects((10.0, 0.0)))
     look(tracker, 1, objects((40.0, 0.0)))
     assert idents(tracker) == [0, 1]
@@ -113,7 +113,7 @@ def test_what_is_too_far_away_is_somebody_else() -> None:
 
 
 def test_speed_and_heading_come_from_motion_and_from_the_body_at_rest() -> None:
-    moving, resting = KalmanTracker(Tracking(confirm=1)), KalmanTracker(Tracking(confirm=1))
+    moving, resting = KalmanTracker(TrackerSettings(confirm=1)), KalmanTracker(TrackerSettings(confirm=1))
     for k in range(12):
         # the detector takes its front for its back
         look(moving, k, objects((2.0, 6.0 * k * STEP), yaw=-np.pi / 2))
@@ -125,7 +125,7 @@ def test_speed_and_heading_come_from_motion_and_from_the_body_at_rest() -> None:
 
 
 def test_between_looks_a_track_moves_on() -> None:
-    tracker = KalmanTracker(Tracking(confirm=1))
+    tracker = KalmanTracker(TrackerSettings(confirm=1))
     for k in range(20):
         look(tracker, k, objects((5.0 * k * STEP, 1.0)))
     later = tracker.confirmed(np.array([0]), np.array([19 * STEP + 0.5]))
@@ -179,7 +179,7 @@ def test_a_snapshot_goes_on_to_the_bit() -> None:
 
 
 def test_a_belief_has_a_row_for_each_scene_asked_for() -> None:
-    tracker = KalmanTracker(Tracking(confirm=1), scenes=3)
+    tracker = KalmanTracker(TrackerSettings(confirm=1), scenes=3)
     found = Objects.cat([objects((1.0, 0.0), scene=0), objects((2.0, 0.0), (30.0, 0.0), scene=2)])
     tracker.update(np.arange(3), np.zeros(3), found)
     belief = belief_from_tracks(tracker.confirmed(np.array([2, 0, 1]), np.zeros(3)), np.array([2, 0, 1]))
@@ -189,6 +189,6 @@ def test_a_belief_has_a_row_for_each_scene_asked_for() -> None:
 
 def test_wrong_settings_are_one_line() -> None:
     with pytest.raises(ConfigError, match="confirm >= 1"):
-        Tracking(confirm=0)
+        TrackerSettings(confirm=0)
     with pytest.raises(ConfigError, match="low <= high"):
-        Tracking(low=0.5, high=0.3)
+        TrackerSettings(low=0.5, high=0.3)

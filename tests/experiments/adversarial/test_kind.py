@@ -25,7 +25,7 @@ from ssad.drivers import make_system
 from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
 from ssad.experiments.adversarial.kind import Adversarial
-from ssad.experiments.adversarial.search_scores import distinct, summary
+from ssad.experiments.adversarial.search_scores import distinct_collisions, summary
 from ssad.experiments.runs import write_report
 from ssad.experiments.suites import load_suite
 from ssad.metrics.realism import FEATURES
@@ -53,8 +53,8 @@ def hit(offset: float = 0.0, *, speed: float = 8.0, **changes: Any) -> Outcome:
 
 def test_copies_of_a_collision_count_once() -> None:
     one, copy, other = hit(), hit(0.3), hit(2.0)
-    assert distinct([one, copy, other]) == [one, other]
-    assert distinct([]) == []
+    assert distinct_collisions([one, copy, other]) == [one, other]
+    assert distinct_collisions([]) == []
 
 
 def test_a_record_says_what_was_found_and_how_often_not() -> None:
@@ -113,7 +113,7 @@ def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp
 def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: {})
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: {})
     kind = Adversarial()
     settings = ["generators=king", "budget=1", "scenarios=[StraightObstacle/00]"]
     with pytest.raises(ConfigError, match=r"generator king: scenario StraightObstacle/00: there is no vehicle in it"):
@@ -127,7 +127,7 @@ def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_se
 
 def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: usual)
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: usual)
     kind = Adversarial()
     settings = [
         "generators=halton",
@@ -169,7 +169,7 @@ def test_equal_runs_have_the_same_hash_and_are_equal_however_long_they_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: usual)
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: usual)
     settings = ["generators=halton", "budget=8", "grade=false", "scenarios=UnprotectedLeftTurn/00", "systems=autopilot"]
     plan = Adversarial().plan(load_suite("adversarial-quick", settings), check=False)
     folders, hashes, tables = [tmp_path / "fast", tmp_path / "slow"], [], []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
-from ssad.experiments.adversarial.collision_view import ADVERSARY, EGO, ROAD, found_view
+from ssad.experiments.adversarial.collision_view import ADVERSARY, EGO, ROAD, draw_collision
 from ssad.experiments.adversarial.kind import Adversarial
 from ssad.experiments.adversarial.page import (
     against_table,
@@ -120,7 +120,7 @@ def test_a_view_shows_ego_and_adversary_where_they_met() -> None:
     x, y = graph.xy[graph.points(0)][0].tolist()
     step = 0.1 * np.arange(31)
     ego, other = (x - 30 + 10 * step, y, 0.0, 10.0), (x + 35 - 10 * step, y, math.pi, 10.0)
-    picture = found_view(make_trace(31, [ego, other]), graph, [1], size=300)
+    picture = draw_collision(make_trace(31, [ego, other]), graph, [1], size=300)
     assert picture.shape == (300, 300, 3)
     blue, red = ((picture == colour).all(-1) for colour in (EGO, ADVERSARY))
     assert blue.sum() > 100
@@ -130,9 +130,9 @@ def test_a_view_shows_ego_and_adversary_where_they_met() -> None:
 
 def test_a_view_has_the_road_also_where_none_of_its_corners_is() -> None:
     graph = load_town("Longreach")
-    lane = max(range(graph.lanes), key=lambda n: float(graph.length[n]))
+    lane = max(range(graph.lane_count), key=lambda n: float(graph.length[n]))
     x, y, yaw, _ = graph.at(lane, 0.5 * float(graph.length[lane]))
-    picture = found_view(make_trace(31, [np.tile([x, y, yaw, 0.0], (31, 1)).T]), graph, [], size=100)
+    picture = draw_collision(make_trace(31, [np.tile([x, y, yaw, 0.0], (31, 1)).T]), graph, [], size=100)
     assert (picture == ROAD).all(-1).mean() > 0.05
 
 
@@ -159,7 +159,7 @@ def test_the_front_of_a_body_is_marked() -> None:
     """The ego drives east: its right edge has a thick dark line, its left one a thin one."""
     graph = load_town("Twinford")
     x, y = graph.xy[graph.points(0)][0].tolist()
-    picture = found_view(make_trace(31, [(x, y, 0.0, 0.0)], size=(8.0, 6.0)), graph, [], size=400)
+    picture = draw_collision(make_trace(31, [(x, y, 0.0, 0.0)], size=(8.0, 6.0)), graph, [], size=400)
     dark = (picture.astype(int).sum(-1) < 3 * 60)[195:205]  # rows through its middle
     columns = np.flatnonzero(dark.all(0))
     front, rear = columns[columns > 200], columns[columns < 200]

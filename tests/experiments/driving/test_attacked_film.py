@@ -11,7 +11,7 @@ import torch
 
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.types import AgentKind, Controller, EpisodeLimits, EpisodeTrace
-from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
+from ssad.experiments.driving.attacked_film import agent_ahead, attacked_frames
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import at_hour
@@ -58,13 +58,13 @@ def white(mesh: Mesh) -> SceneEdit:
 
 
 def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
-    assert first_ahead(trace) == 1
+    assert agent_ahead(trace) == 1
     behind = replace(trace, x=2 * trace.x[:, :1] - trace.x, y=2 * trace.y[:, :1] - trace.y)
-    assert first_ahead(behind) is None
+    assert agent_ahead(behind) is None
     walker = trace.kind.copy()
     walker[1] = AgentKind.WALKER
-    assert first_ahead(replace(trace, kind=walker)) is None
-    assert first_ahead(replace(trace, kind=walker), AgentKind.WALKER) == 1
+    assert agent_ahead(replace(trace, kind=walker)) is None
+    assert agent_ahead(replace(trace, kind=walker), AgentKind.WALKER) == 1
 
 
 def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:

@@ -19,7 +19,7 @@ from ssad.engine.kind import Cell, Job, Plan, Resources
 from ssad.experiments import scenario_kind
 from ssad.experiments.driving import kind as driving_kind
 from ssad.experiments.driving.kind import Driving, DrivingSuite
-from ssad.experiments.scenario_kind import route_of, suite_scenarios
+from ssad.experiments.scenario_kind import route_key, suite_scenarios
 
 
 def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
@@ -104,7 +104,7 @@ def test_cells_are_named_and_described(monkeypatch: pytest.MonkeyPatch) -> None:
         f"{system}/{name}" for system in ("autopilot", "blind") for name in ("a/00", "a/00#1", "b", "b#1")
     ]
     one, again = plan.cells[:2]
-    assert one.fields == {"system": "autopilot", "group": "A", "cluster": route_of(scenario("a/00"))}
+    assert one.fields == {"system": "autopilot", "group": "A", "cluster": route_key(scenario("a/00"))}
     assert plan.cells[2].fields["group"] == "StraightObstacle"
     assert (one.spec["repetition"], one.spec["spread"]) == (0, 0.0)
     assert (again.spec["repetition"], again.spec["spread"]) == (1, 0.5)

@@ -23,14 +23,14 @@ from rich.console import Console
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
-from ssad.core.lane_strips import thin
-from ssad.core.safeio import plain
+from ssad.core.lane_strips import simplify_polyline
+from ssad.core.safeio import to_plain_json
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
 from ssad.experiments.driving.driving_tables import average_note, full_table, precrash_table, summary_table
-from ssad.experiments.driving.embed import SCALE, episode_data, origin, pack, town_data
+from ssad.experiments.driving.embed import SCALE, encode_int16, episode_data, origin, town_data
 from ssad.experiments.driving.episodes import load_episodes
-from ssad.experiments.driving.page import _tile
+from ssad.experiments.driving.page import _system_tile
 from ssad.experiments.runs import write_report
 from ssad.metrics import episode_metrics
 from ssad.report import write_video
@@ -71,7 +71,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             common = {"key": key, "suite": "t", "system": system, "group": s.group, "seed": 1}
             spec = {"scenario": {"name": name, "type": s.type, "town": s.town}, "system": system, "repetition": 0}
             line = common | {"status": "ok", "reason": "", "spec": spec, "n": 1, "versions": {}, "wall_s": 0.1}
-            line["metrics"] = plain(episode_metrics(trace).as_dict())
+            line["metrics"] = to_plain_json(episode_metrics(trace).as_dict())
             line["artefacts"] = {"trace": f"traces/{key}.npz"}
             lines.append(line)
             episodes.append(common | {"scenario": name, "end": trace.end, "town": s.town})
@@ -203,13 +203,13 @@ def test_embedded_replay_gives_back_the_trace(run_folder: Path) -> None:
 
 def test_pack_survives_wrap_around() -> None:
     columns = np.array([[32767, -32767, 0, 12], [-5, -5, 7, 32767]], np.int16)
-    np.testing.assert_array_equal(unpack(pack(columns), 2), columns)
+    np.testing.assert_array_equal(unpack(encode_int16(columns), 2), columns)
 
 
 def test_thin_keeps_the_shape() -> None:
     angle = np.linspace(0, np.pi / 2, 200)
     arc = 20 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    kept = thin(arc, 0.05)
+    kept = simplify_polyline(arc, 0.05)
     assert len(kept) < 20
     middle = 0.5 * (kept[1:] + kept[:-1])
     assert np.abs(np.hypot(*middle.T) - 20).max() < 0.06
@@ -428,14 +428,14 @@ def test_a_video_plays_and_seeks_in_a_browser(run_folder: Path, tmp_path: Path) 
 
 
 def test_a_tile_says_where_it_averages_several_groups(run_folder: Path) -> None:
-    names = [part["name"] for part in _tile(load_episodes(load_run(run_folder)), "blind")["parts"]]
+    names = [part["name"] for part in _system_tile(load_episodes(load_run(run_folder)), "blind")["parts"]]
     assert names == ["pre-crash, mean of the groups", "natural traffic"]
 
 
 def test_the_roads_beside_a_route_are_kept() -> None:
     """Lanes of the cell of the grid that a route of one point lies in are kept, those far away are not."""
     graph = load_town("Twinford")
-    lane = max(range(graph.lanes), key=lambda n: float(graph.length[n]))
+    lane = max(range(graph.lane_count), key=lambda n: float(graph.length[n]))
     middle = graph.xy[graph.points(lane)][len(graph.xy[graph.points(lane)]) // 2].astype(np.float64)
     trace = make_trace(2, [(*middle, 0.0, 0.0)])
     near = town_data(graph, [replace(trace, route=np.array([middle], np.float32))])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
-from ssad.core.perception import Perceived
+from ssad.core.perception import DrivePerception
 from ssad.experiments.gap import drive_sheet as module
 from ssad.experiments.gap.drive_sheet import drive_sheet
 
@@ -31,8 +31,8 @@ def test_a_sheet_shows_the_last_two_seconds_before_a_contact(
         shown.append(time)
         return np.zeros((2, 3, 3), np.uint8)
 
-    monkeypatch.setattr(module, "_row", row)
+    monkeypatch.setattr(module, "_draw_moment", row)
     bodies = ((0.0, 0.0, 0.0, 0.0), (9.0, 0.0, 0.0, 0.0))
     trace = make_trace(STEPS, bodies, contact_agent=touched)
-    assert drive_sheet(trace, Perceived([], [], {}), [], cast("Any", None)).shape == (6, 3, 3)
+    assert drive_sheet(trace, DrivePerception([], [], {}), [], cast("Any", None)).shape == (6, 3, 3)
     assert shown == pytest.approx(times)

@@ -261,7 +261,7 @@ def test_the_suites_that_are_shipped_can_be_planned() -> None:
 def test_the_suite_has_conditions_enough_for_its_rank_correlation() -> None:
     suite = load_suite("gap")
     assert isinstance(suite, GapSuite)
-    for system in (one for one in suite.systems if not one.perfect):
+    for system in (one for one in suite.systems if not one.is_perfect):
         perturbed = [one.perturbation for one in conditions_of(suite) if one.system == system and one.perturbation]
         under = [(perturbation.name, perturbation.severity) for perturbation in perturbed]
         assert len(under) == len(set(under)) >= 40

@@ -14,11 +14,11 @@ from ssad import World, build_episode, load_scenarios, load_town
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import EpisodeTrace, LaneType
-from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import PerfectEyes, nuscenes_cameras
+from ssad.drivers.perceiving.driver import PerceivingDriver
+from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_cameras
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.experiments.gap.drive_sheet import RecordedDrive
-from ssad.experiments.gap.mcap import COLOURS, need_mcap, write_mcap
+from ssad.experiments.gap.mcap import COLOURS, require_mcap, write_mcap
 from ssad.world.rollout import rollout
 
 
@@ -28,9 +28,9 @@ def driven() -> tuple[EpisodeTrace, RecordedDrive, Any]:
     cameras = nuscenes_cameras(96)
     watcher = PerceptionRecorder(cameras, 1)
     episode = build_episode(scenario, town, seed=0)
-    (trace,) = rollout(World([episode], {town.name: town}), Perceiving(PerfectEyes(cameras), watch=watcher))
+    (trace,) = rollout(World([episode], {town.name: town}), PerceivingDriver(PerfectPerceiver(cameras), watch=watcher))
     pictures = [(0.2 * k, np.full((54, 96, 3), 20 * k, np.uint8)) for k in range(5)]
-    return trace, RecordedDrive("", trace, watcher.perceived(0), pictures), town
+    return trace, RecordedDrive("", trace, watcher.perception(0), pictures), town
 
 
 def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
         "/map": 1,
         "/truth": steps,
         "/plan": steps,
-        "/tracks": len(seen.perceived.known),
+        "/tracks": len(seen.perceived.tracks),
         "/camera": 5,
         "/camera/calibration": 5,
         "/above": steps,
@@ -72,13 +72,13 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
     (first, *_) = told["/truth"]
     assert len(first[1].entities[0].cubes) == int(trace.active[0].sum())
     found = {round(time, 3): message.entities[0].cubes for time, message in told["/detections"]}
-    looks = {round(time, 3): objects for time, objects in seen.perceived.looks if objects is not None}
+    looks = {round(time, 3): objects for time, objects in seen.perceived.detections if objects is not None}
     assert found.keys() == looks.keys()
     assert max(len(objects) for objects in looks.values()) > 0
     for time, objects in looks.items():
         places = [(cube.pose.position.x, cube.pose.position.y) for cube in found[time]]
         np.testing.assert_allclose(np.reshape(places, (-1, 2)), objects.place)
-    believed = [len(tracks) for _, tracks in seen.perceived.known]
+    believed = [len(tracks) for _, tracks in seen.perceived.tracks]
     assert [len(message.entities[0].cubes) for _, message in told["/tracks"]] == believed
     assert max(believed) > 0
     ((_, streets),) = told["/map"]
@@ -101,7 +101,7 @@ def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(ConfigError, match=r"--mcap needs .*\[view\]"):
-        need_mcap()
+        require_mcap()
 
 
 def test_colours_are_shares() -> None:

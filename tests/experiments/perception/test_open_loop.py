@@ -16,7 +16,7 @@ from ssad.experiments.perception.digital.kind import Digital
 from ssad.experiments.perception.kind import Perception
 from ssad.experiments.perception.open_loop import OpenLoopKind, TargetCondition
 from ssad.experiments.perception.physical.kind import Physical
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
 from ssad.experiments.perception.scored_data import Victims
 from ssad.experiments.perception.shifts.kind import Detection
@@ -83,8 +83,8 @@ def test_what_acts_on_scenes_is_refused_on_a_target_with_the_same_words(
     family: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused = perturbation(family)
-    images = LightableClips(tmp_path, 1)
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    images = RelightableTargetImages(tmp_path, 1)
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "_clean_sightings", lambda *given: (seen(0.0),))
     job = Job(tmp_path, "cpu", {"detectors": {}, "replicates": 0, "seed": 0, "floor": 0.0})
     for kind in (Physical, Perception):
@@ -123,15 +123,15 @@ def test_the_floor_is_the_same_and_the_clean_target_is_seen_once(
         def on_target(self, images: Any) -> Iterator[Any]:
             return iter([0.0])
 
-    images = LightableClips(tmp_path, 1)
+    images = RelightableTargetImages(tmp_path, 1)
     shown: list[Any] = []
 
     def sightings(detector: Any, given: Any) -> Iterator[TargetSighting]:
         shown.extend(given)
         yield seen(0.0)
 
-    monkeypatch.setattr(LightableClips, "clean", lambda self: iter(["clean"]))
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(RelightableTargetImages, "clean", lambda self: iter(["clean"]))
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "sightings", sightings)
     cell = Cell("key", "cell", "one", 0, {"view": "drive"}, {})
     for kind in (Physical, Perception):
@@ -159,10 +159,10 @@ def test_a_rate_is_held_to_the_floor_of_the_suite_at_its_own_score(
     def sightings(detector: Any, given: Any) -> Iterator[TargetSighting]:
         yield from (seen(0.9), seen(0.1))
 
-    monkeypatch.setattr(LightableClips, "clean", lambda self: iter([]))
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(RelightableTargetImages, "clean", lambda self: iter([]))
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "sightings", sightings)
-    images = LightableClips(tmp_path, 2)
+    images = RelightableTargetImages(tmp_path, 2)
     monkeypatch.setattr(Perception, "scenes", lambda self, cell, job: ())
     monkeypatch.setattr(Perception, "target", lambda *given: TargetCondition(images, Shown(), "sedan"))
     settings = {"detectors": {}, "replicates": 0, "seed": 0, "floor": floor}

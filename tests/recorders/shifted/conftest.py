@@ -9,7 +9,7 @@ import pytest
 from helpers.shifted_roots import options
 from helpers.tiny import make_tiny
 
-from ssad.recorders.shifted import materialise
+from ssad.recorders.shifted import write_shifted_roots
 
 
 @pytest.fixture(scope="session")
@@ -27,7 +27,7 @@ def source(clean: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def fog(clean: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished root; not to be changed."""
-    return materialise(options(clean, tmp_path_factory.mktemp("fog")), workers=0)[0].root
+    return write_shifted_roots(options(clean, tmp_path_factory.mktemp("fog")), workers=0)[0].root
 
 
 @pytest.fixture

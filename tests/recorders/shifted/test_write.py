@@ -21,7 +21,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.recorders.shifted import SceneShifter, check_manifest, materialise, verify
+from ssad.recorders.shifted import SceneShifter, check_manifest, verify, write_shifted_roots
 from ssad.recorders.shifted import scene_writer as work
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, transformed_boxes
 
@@ -59,7 +59,7 @@ def test_every_shift_is_written_as_it_is_on_the_fly(clean: Path, tmp_path: Path,
         clean, tmp_path / "out", *SHIFTS, calibration=calibration, severities=("random",), scenes=SCENES[:1], seed=4
     )
     scene = NuScenes(clean, VERSION).scene(SCENES[0])
-    for written in materialise(chosen, workers=0):
+    for written in write_shifted_roots(chosen, workers=0):
         name = written.root.name.removesuffix("-random")
         assert written.failed == 0
         assert 0 < written.applied <= 1
@@ -86,7 +86,9 @@ def test_every_shift_is_written_as_it_is_on_the_fly(clean: Path, tmp_path: Path,
 
 def test_severity_0_is_the_dataset_itself(clean: Path, tmp_path: Path) -> None:
     """A file in which nothing changes is linked, never encoded anew: pixel for pixel the clean one."""
-    for written in materialise(options(clean, tmp_path / "o", "fog", "scale", "gaussian", severities=(0,)), workers=0):
+    for written in write_shifted_roots(
+        options(clean, tmp_path / "o", "fog", "scale", "gaussian", severities=(0,)), workers=0
+    ):
         assert (written.shifted, written.linked, written.failed, written.applied) == (0, 42, 0, 0.0)
         check_manifest(written.root)
         assert verify(written.root) == (42, [])
@@ -96,7 +98,7 @@ def test_severity_0_is_the_dataset_itself(clean: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_not_asked_for_is_linked(clean: Path, tmp_path: Path) -> None:
-    written = materialise(options(clean, tmp_path / "o", sweeps=False, lidar=False), workers=0)[0]
+    written = write_shifted_roots(options(clean, tmp_path / "o", sweeps=False, lidar=False), workers=0)[0]
     assert (written.shifted, written.linked) == (24, 18)
     for name, record in lines(written.root).items():
         assert record["state"] == ("shifted" if name.startswith("samples/CAM") else "linked")
@@ -108,7 +110,7 @@ def test_what_is_not_asked_for_is_linked(clean: Path, tmp_path: Path) -> None:
 def test_a_file_neither_asked_for_nor_in_the_dataset_is_absent(source: Path, tmp_path: Path) -> None:
     """Key frames alone are a common download."""
     shutil.rmtree(source / "sweeps")
-    written = materialise(options(source, tmp_path / "o", "gaussian", sweeps=False), workers=0)[0]
+    written = write_shifted_roots(options(source, tmp_path / "o", "gaussian", sweeps=False), workers=0)[0]
     assert (written.shifted, written.failed) == (28, 0)
     assert check_manifest(written.root) is not None
     assert verify(written.root) == (42, [])
@@ -121,15 +123,15 @@ def test_a_file_neither_asked_for_nor_in_the_dataset_is_absent(source: Path, tmp
 
 def test_tables_without_image_sizes(source: Path, clean: Path, tmp_path: Path) -> None:
     edit(source, "sample_data", lambda row: row.update(width=None, height=None))
-    one = materialise(options(source, tmp_path / "a", "scale"), workers=0)[0].root
-    two = materialise(options(clean, tmp_path / "b", "scale"), workers=0)[0].root
+    one = write_shifted_roots(options(source, tmp_path / "a", "scale"), workers=0)[0].root
+    two = write_shifted_roots(options(clean, tmp_path / "b", "scale"), workers=0)[0].root
     assert {n: (one / n).read_bytes() for n in lines(one)} == {n: (two / n).read_bytes() for n in lines(two)}
 
 
 @pytest.mark.parametrize(("calibration", "scope"), [("physical", "scene_token"), ("paper", "sample_token")])
 def test_random_severity_is_shared(clean: Path, tmp_path: Path, calibration: Any, scope: str) -> None:
     chosen = options(clean, tmp_path / "o", "gaussian", severities=("random",), calibration=calibration, seed=1)
-    root = materialise(chosen, workers=0)[0].root
+    root = write_shifted_roots(chosen, workers=0)[0].root
     drawn: dict[str, set[int]] = {}
     spec = ShiftSpec("gaussian", 1, 1, calibration)
     data = NuScenes(clean, VERSION)
@@ -149,8 +151,8 @@ def test_jpeg_subsampling_does_not_weaken_noise(source: Path, tmp_path: Path) ->
         path.write_bytes(encode_jpeg(grey, 95))
     chosen = options(source, tmp_path / "a", "gaussian", sweeps=False, lidar=False, scenes=SCENES[:1])
     drawn, _ = shift_images(grey, None, ShiftSpec("gaussian", 3))
-    kept = materialise(chosen, workers=0)[0].root
-    weak = materialise(replace(chosen, out=tmp_path / "b", subsampling="420"), workers=0)[0].root
+    kept = write_shifted_roots(chosen, workers=0)[0].root
+    weak = write_shifted_roots(replace(chosen, out=tmp_path / "b", subsampling="420"), workers=0)[0].root
     share = {}
     for root in (kept, weak):
         levels = [read_image(root / n).astype(float).std() for n in lines(root, SCENES[0]) if "samples/CAM" in n]
@@ -163,7 +165,7 @@ def test_jpeg_subsampling_does_not_weaken_noise(source: Path, tmp_path: Path) ->
 
 
 def test_original_labels_are_those_of_the_dataset(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
+    root = write_shifted_roots(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
     source = (clean / VERSION / "sample_annotation.json").read_bytes()
     assert (root / VERSION / "sample_annotation.json").read_bytes() == source
     assert (root / VERSION / "sample_annotation.original.json").read_bytes() == source
@@ -171,7 +173,7 @@ def test_original_labels_are_those_of_the_dataset(clean: Path, tmp_path: Path) -
 
 def test_transformed_labels_are_the_moved_boxes_with_their_points(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "o", "scale", labels="transformed", seed=3)
-    root = materialise(chosen, workers=0)[0].root
+    root = write_shifted_roots(chosen, workers=0)[0].root
     assert (root / VERSION / "sample_annotation.json").readlink() == Path("sample_annotation.transformed.json")
     assert table(root, "sample_annotation") == table(root, "sample_annotation.transformed")
     old, new = NuScenes(clean, VERSION), NuScenes(root, VERSION)
@@ -219,7 +221,7 @@ def test_counts_are_of_the_sweep_that_is_written(clean: Path, tmp_path: Path) ->
     counts = {}
     for lidar in (True, False):
         chosen = options(clean, tmp_path / str(lidar), "snow", severities=(5,), lidar=lidar)
-        root = materialise(chosen, workers=0)[0].root
+        root = write_shifted_roots(chosen, workers=0)[0].root
         rows = table(root, "sample_annotation.transformed")
         counts[lidar] = {row["token"]: row["num_lidar_pts"] for row in rows}
         kept = [{k: v for k, v in row.items() if k != "num_lidar_pts"} for row in rows]
@@ -239,7 +241,7 @@ def test_the_official_toolkit_reads_a_root(clean: Path, tmp_path: Path) -> None:
     python = os.environ.get("SSAD_DEVKIT_PYTHON")
     if not python:
         pytest.skip("SSAD_DEVKIT_PYTHON names no interpreter with nuscenes-devkit")
-    root = materialise(options(clean, tmp_path / "o", "rotation", labels="transformed"), workers=0)[0].root
+    root = write_shifted_roots(options(clean, tmp_path / "o", "rotation", labels="transformed"), workers=0)[0].root
     shown = subprocess.run([python, str(HELPER), str(root), VERSION], capture_output=True, text=True, check=False)
     assert shown.returncode == 0, shown.stderr
     found = json.loads(shown.stdout)
@@ -257,28 +259,28 @@ def test_the_official_toolkit_reads_a_root(clean: Path, tmp_path: Path) -> None:
 def test_workers_order_and_runs_do_not_matter(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "a", "snow", "scale", severities=("random",))
     seen: list[tuple[int, int]] = []
-    materialise(chosen, workers=0, progress=lambda done, of: seen.append((done, of)))
+    write_shifted_roots(chosen, workers=0, progress=lambda done, of: seen.append((done, of)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     expected = tree(tmp_path / "a")
-    materialise(replace(chosen, out=tmp_path / "b", scenes=SCENES[::-1]), workers=2)
+    write_shifted_roots(replace(chosen, out=tmp_path / "b", scenes=SCENES[::-1]), workers=2)
     assert tree(tmp_path / "b") == expected
-    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[1:]), workers=0)
+    write_shifted_roots(replace(chosen, out=tmp_path / "c", scenes=SCENES[1:]), workers=0)
     for shift in chosen.shifts:
         fails(StoreError, lambda s=shift: check_manifest(tmp_path / "c" / f"{s}-random", SCENES), SCENES[0])
-    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[:1]), workers=0)
+    write_shifted_roots(replace(chosen, out=tmp_path / "c", scenes=SCENES[:1]), workers=0)
     assert tree(tmp_path / "c") == expected
 
 
 def test_asked_for_twice_is_written_once(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "a", "fog", "fog", severities=(3, 3), scenes=(SCENES[0], SCENES[0]))
-    assert len(materialise(chosen, workers=0)) == 1
+    assert len(write_shifted_roots(chosen, workers=0)) == 1
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_ray_gives_the_same_bytes(clean: Path, fog: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    materialise(options(clean, tmp_path / "o"), ray="local")
+    write_shifted_roots(options(clean, tmp_path / "o"), ray="local")
     assert tree(tmp_path / "o" / "fog-3") == tree(fog)
 
 
@@ -292,7 +294,7 @@ def test_options_and_shards_travel(clean: Path, tmp_path: Path) -> None:
 
 def test_resume_keeps_what_stands_and_redoes_what_does_not(clean: Path, fog: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "o")
-    root = materialise(chosen, workers=0)[0].root
+    root = write_shifted_roots(chosen, workers=0)[0].root
     files = sorted(n for n, r in lines(root).items() if r["kind"] == "camera")
     gone, cut, replaced, linked = files[:4]
     (root / gone).unlink()
@@ -303,7 +305,7 @@ def test_resume_keeps_what_stands_and_redoes_what_does_not(clean: Path, fog: Pat
     (root / linked).unlink()
     (root / linked).symlink_to(clean / linked)
     before = {name: (root / name).stat().st_mtime_ns for name in lines(root) if name not in files[:4]}
-    written = materialise(chosen, workers=0)[0]
+    written = write_shifted_roots(chosen, workers=0)[0]
     assert (written.shifted, written.failed) == (42, 0)
     assert {name: (root / name).stat().st_mtime_ns for name in before} == before
     assert tree(root) == tree(fog)
@@ -317,7 +319,7 @@ def test_a_torn_manifest_line_costs_one_file(clean: Path, fog: Path, tmp_path: P
     path.write_bytes(path.read_bytes()[:-50] + rest)
     last = max(lines(fog, SCENES[0]))
     before = {n: (root / n).stat().st_ino for n in lines(fog)}
-    materialise(options(clean, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert [n for n, inode in before.items() if (root / n).stat().st_ino != inode] == [last]
     assert tree(root) == tree(fog)
 
@@ -327,7 +329,7 @@ def test_damaged_labels_are_made_again(clean: Path, fog: Path, tmp_path: Path) -
     root = tmp_path / "o" / "fog-3"
     (root / "manifest" / f"{SCENES[0]}.labels.json").write_text('{"lines"')
     (root / "manifest" / f"{SCENES[1]}.labels.json").unlink()
-    materialise(options(clean, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert tree(root) == tree(fog)
 
 
@@ -338,7 +340,7 @@ def test_leftovers_of_a_killed_run_are_removed(clean: Path, fog: Path, tmp_path:
     (root / ".unfinished" / "123-abc").write_bytes(b"half")
     (root / VERSION / ".sample_annotation.transformed-12-0123abcd.tmp.json").write_bytes(b"half")
     (root / "manifest" / ".probe-77-0123abcd.tmp").write_bytes(b"")
-    materialise(options(clean, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert tree(root) == tree(fog)
 
 
@@ -346,25 +348,29 @@ def test_a_root_of_another_identity_is_refused(clean: Path, fog: Path, tmp_path:
     shutil.copytree(fog, tmp_path / "o" / "fog-3", symlinks=True)
     before = tree(tmp_path / "o")
     for other in ({"seed": 1}, {"quality": 90}, {"calibration": "paper"}, {"sweeps": False}, {"subsampling": "444"}):
-        fails(StoreError, lambda o=other: materialise(options(clean, tmp_path / "o", **o), workers=0), "other data or")
+        fails(
+            StoreError,
+            lambda o=other: write_shifted_roots(options(clean, tmp_path / "o", **o), workers=0),
+            "other data or",
+        )
     assert tree(tmp_path / "o") == before
 
 
 def test_a_root_of_other_tables_is_refused(source: Path, tmp_path: Path) -> None:
-    materialise(options(source, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(source, tmp_path / "o"), workers=0)
     edit(source, "ego_pose", lambda row: row["translation"].__setitem__(0, row["translation"][0] + 1))
-    fails(StoreError, lambda: materialise(options(source, tmp_path / "o"), workers=0), "other data or options")
+    fails(StoreError, lambda: write_shifted_roots(options(source, tmp_path / "o"), workers=0), "other data or options")
     # and the same process reads the changed tables, not those it knows
-    one = materialise(options(source, tmp_path / "p", "snow"), workers=0)[0].root
+    one = write_shifted_roots(options(source, tmp_path / "p", "snow"), workers=0)[0].root
     work._DATA.clear()
-    two = materialise(options(source, tmp_path / "q", "snow"), workers=0)[0].root
+    two = write_shifted_roots(options(source, tmp_path / "q", "snow"), workers=0)[0].root
     assert tree(one) == tree(two)
 
 
 def test_labels_may_be_asked_for_anew(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
+    root = write_shifted_roots(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
     before = {n: (root / n).stat().st_ino for n in lines(root)}
-    materialise(options(clean, tmp_path / "o", "scale", labels="transformed"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o", "scale", labels="transformed"), workers=0)
     manifest = check_manifest(root)
     assert manifest is not None
     assert manifest["labels"] == "transformed"
@@ -380,8 +386,8 @@ def test_one_shift_at_a_time(clean: Path, tmp_path: Path) -> None:
     out.mkdir()
     with open(out / ".lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        fails(StoreError, lambda: materialise(options(clean, out), workers=0), "another ssad shift")
-    materialise(options(clean, out, scenes=SCENES[:1]), workers=0)
+        fails(StoreError, lambda: write_shifted_roots(options(clean, out), workers=0), "another ssad shift")
+    write_shifted_roots(options(clean, out, scenes=SCENES[:1]), workers=0)
 
 
 # ---------------------------------------------------------------- options
@@ -396,10 +402,10 @@ def test_options_that_make_no_sense(clean: Path, fog: Path, tmp_path: Path) -> N
         fails(ConfigError, lambda s=severity: options(clean, tmp_path, severities=(s,)))
     fails(ConfigError, lambda: options(clean, tmp_path, "smog"), "unknown shift")
     out = tmp_path / "o"
-    fails(ConfigError, lambda: materialise(options(clean, out, scenes=("scene-9",)), workers=0), "scene-9")
-    fails(ConfigError, lambda: materialise(options(clean, out), workers=-1), "-1 workers")
-    fails(ConfigError, lambda: materialise(options(tmp_path / "none", out), workers=0), "no such folder")
-    fails(ConfigError, lambda: materialise(options(fog, out), workers=0), "shifted already")
+    fails(ConfigError, lambda: write_shifted_roots(options(clean, out, scenes=("scene-9",)), workers=0), "scene-9")
+    fails(ConfigError, lambda: write_shifted_roots(options(clean, out), workers=-1), "-1 workers")
+    fails(ConfigError, lambda: write_shifted_roots(options(tmp_path / "none", out), workers=0), "no such folder")
+    fails(ConfigError, lambda: write_shifted_roots(options(fog, out), workers=0), "shifted already")
     assert not out.exists()
 
 
@@ -410,5 +416,7 @@ def test_nothing_is_written_through_a_link_into_the_dataset(clean: Path, tmp_pat
         place = out / "fog-3" / name
         place.parent.mkdir(parents=True)
         place.symlink_to(clean / name)
-        fails(StoreError, lambda o=out: materialise(options(clean, o), workers=0), name, "leads into the dataset")
+        fails(
+            StoreError, lambda o=out: write_shifted_roots(options(clean, o), workers=0), name, "leads into the dataset"
+        )
     assert tree(clean) == before

@@ -19,7 +19,7 @@ from helpers.shifted_roots import SCENES, VERSION, edit, fails, first, lines, op
 
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.images import encode_jpeg
-from ssad.recorders.shifted import check_manifest, materialise, read_manifest, verify
+from ssad.recorders.shifted import check_manifest, read_manifest, verify, write_shifted_roots
 from ssad.recorders.shifted import scene_writer as work
 from ssad.recorders.shifted import write as run
 
@@ -34,7 +34,7 @@ def test_a_shift_that_changes_nothing_is_an_error(source: Path, tmp_path: Path) 
         lambda row: row.update(first_annotation_token="", last_annotation_token="", nbr_annotations=0),
     )
     chosen = options(source, tmp_path / "o", "rotation", "gaussian")
-    message = fails(StoreError, lambda: materialise(chosen, workers=0), "rotation changed none of 36 images")
+    message = fails(StoreError, lambda: write_shifted_roots(chosen, workers=0), "rotation changed none of 36 images")
     assert message.rsplit(": ", 1)[1]  # a reason
     fails(StoreError, lambda: check_manifest(tmp_path / "o" / "rotation-3"), "not complete")
     assert verify(tmp_path / "o" / "gaussian-3") == (42, [])  # the other root is finished all the same
@@ -72,9 +72,9 @@ def test_a_broken_image_is_on_record_and_mending_it_completes(
     name = str(broken.relative_to(source))
     data = broken.read_bytes()
     chosen = options(source, tmp_path / "o", shift)
-    expected = tree(materialise(replace(chosen, out=tmp_path / "whole"), workers=0)[0].root)
+    expected = tree(write_shifted_roots(replace(chosen, out=tmp_path / "whole"), workers=0)[0].root)
     damage(broken)
-    written = materialise(chosen, workers=0)[0]
+    written = write_shifted_roots(chosen, workers=0)[0]
     assert written.failed == 1
     assert written.shifted + written.linked == 41
     assert name in written.reasons[0]
@@ -83,9 +83,9 @@ def test_a_broken_image_is_on_record_and_mending_it_completes(
     assert not (written.root / name).exists()
     assert not (written.root / "manifest.json").exists()
     fails(StoreError, lambda: check_manifest(written.root), "not complete")
-    assert materialise(chosen, workers=0)[0] == written  # again, with the same end
+    assert write_shifted_roots(chosen, workers=0)[0] == written  # again, with the same end
     broken.write_bytes(data)
-    assert materialise(chosen, workers=0)[0].failed == 0
+    assert write_shifted_roots(chosen, workers=0)[0].failed == 0
     assert tree(written.root) == expected
 
 
@@ -95,13 +95,13 @@ def test_a_broken_sweep_is_on_record_and_mending_it_completes(source: Path, tmp_
     broken = min(source.glob("samples/LIDAR_TOP/*.bin"))
     data = broken.read_bytes()
     chosen = options(source, tmp_path / "o", "fog", "scale", lidar=lidar, scenes=SCENES[:1])
-    materialise(replace(chosen, out=tmp_path / "whole"), workers=0)
+    write_shifted_roots(replace(chosen, out=tmp_path / "whole"), workers=0)
     broken.write_bytes(data[:-7])
-    for written in materialise(chosen, workers=0):
+    for written in write_shifted_roots(chosen, workers=0):
         assert written.failed == 1
         assert "cut short" in written.reasons[0]
     broken.write_bytes(data)
-    assert [w.failed for w in materialise(chosen, workers=0)] == [0, 0]
+    assert [w.failed for w in write_shifted_roots(chosen, workers=0)] == [0, 0]
     assert tree(tmp_path / "o") == tree(tmp_path / "whole")
 
 
@@ -109,8 +109,8 @@ def test_a_failed_scene_does_not_hold_up_another(source: Path, tmp_path: Path) -
     broken = min(source.glob("samples/CAM_FRONT/scene-0103*.jpg"))
     _truncated(broken)
     chosen = options(source, tmp_path / "o", scenes=SCENES[:1])
-    assert materialise(chosen, workers=0)[0].failed == 1
-    root = materialise(replace(chosen, scenes=SCENES[1:]), workers=0)[0].root
+    assert write_shifted_roots(chosen, workers=0)[0].failed == 1
+    root = write_shifted_roots(replace(chosen, scenes=SCENES[1:]), workers=0)[0].root
     assert check_manifest(root, SCENES[1:]) is not None
     fails(StoreError, lambda: check_manifest(root, SCENES), SCENES[0])
 
@@ -119,9 +119,14 @@ def test_a_failed_scene_does_not_hold_up_another(source: Path, tmp_path: Path) -
 def test_broken_tables_are_one_line_before_anything_is_written(source: Path, tmp_path: Path, name: str) -> None:
     path = source / VERSION / f"{name}.json"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=0), f"{name}.json")
+    fails(FormatError, lambda: write_shifted_roots(options(source, tmp_path / "o"), workers=0), f"{name}.json")
     path.unlink()
-    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=0), f"{name}.json", "no such file")
+    fails(
+        FormatError,
+        lambda: write_shifted_roots(options(source, tmp_path / "o"), workers=0),
+        f"{name}.json",
+        "no such file",
+    )
     assert not (tmp_path / "o").exists()
 
 
@@ -141,7 +146,7 @@ def test_boxes_behind_around_and_without_size_do_no_harm(source: Path, tmp_path:
     for shift in ("scale", "shear", "rotation", "motion_blur"):
         # none is seen: that is said, in one line
         with contextlib.suppress(StoreError):
-            written = materialise(options(source, tmp_path / "o", shift, scenes=SCENES[:1]), workers=0)[0]
+            written = write_shifted_roots(options(source, tmp_path / "o", shift, scenes=SCENES[:1]), workers=0)[0]
             assert written.failed == 0
             assert verify(written.root) == (21, [])
 
@@ -149,13 +154,19 @@ def test_boxes_behind_around_and_without_size_do_no_harm(source: Path, tmp_path:
 def test_a_box_without_volume_stays_as_it_is(source: Path, clean: Path, tmp_path: Path) -> None:
     token = table(source, "sample_annotation")[0]["token"]
     edit(source, "sample_annotation", lambda row: row["token"] == token and row.update(size=[0.0, 4.0, 1.5]))
-    written = materialise(options(source, tmp_path / "o", "scale", "shear", "rotation", "motion_blur"), workers=0)
+    written = write_shifted_roots(
+        options(source, tmp_path / "o", "scale", "shear", "rotation", "motion_blur"), workers=0
+    )
     for root in (w.root for w in written):
         assert verify(root) == (42, [])
         rows = {row["token"]: row for row in table(root, "sample_annotation.transformed")}
         assert rows[token] == table(source, "sample_annotation")[0]
     edit(source, "sample_annotation", lambda row: row.update(size=[0.0, 0.0, 0.0]))
-    fails(StoreError, lambda: materialise(options(source, tmp_path / "p", "scale"), workers=0), "none of 36 images")
+    fails(
+        StoreError,
+        lambda: write_shifted_roots(options(source, tmp_path / "p", "scale"), workers=0),
+        "none of 36 images",
+    )
 
 
 def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path) -> None:
@@ -164,7 +175,9 @@ def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path
         "calibrated_sensor",
         lambda row: row["camera_intrinsic"] and row.update(camera_intrinsic=[[0.0] * 3] * 3),
     )
-    for written in materialise(options(source, tmp_path / "o", "fog", "sunlight", "scale", "gaussian"), workers=0):
+    for written in write_shifted_roots(
+        options(source, tmp_path / "o", "fog", "sunlight", "scale", "gaussian"), workers=0
+    ):
         assert written.failed == 36
         assert "no focal length" in written.reasons[0]
 
@@ -174,13 +187,17 @@ def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path
 
 def test_output_below_a_file(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    fails(StoreError, lambda: materialise(options(clean, tmp_path / "file" / "o"), workers=0), "cannot write there")
+    fails(
+        StoreError,
+        lambda: write_shifted_roots(options(clean, tmp_path / "file" / "o"), workers=0),
+        "cannot write there",
+    )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_read_only_output(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "o").mkdir(mode=0o500)
-    fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), "cannot write there")
+    fails(StoreError, lambda: write_shifted_roots(options(clean, tmp_path / "o"), workers=0), "cannot write there")
 
 
 @pytest.mark.parametrize(
@@ -203,14 +220,14 @@ def test_output_that_cannot_be_written_loses_nothing(
     moved = os.replace
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), os.strerror(code))
+        fails(StoreError, lambda: write_shifted_roots(options(clean, tmp_path / "o"), workers=0), os.strerror(code))
     whole = tree(fog)
     for name, data in tree(tmp_path / "o" / "fog-3").items():
         assert name != "manifest.json"
         assert not Path(name).name.startswith(".")
         if name.startswith(("samples", "sweeps", VERSION)):
             assert data == whole[name]
-    materialise(options(clean, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == whole
 
 
@@ -228,12 +245,12 @@ def largest_file(size: int) -> Iterator[None]:
 @pytest.mark.parametrize("size", [100, 3000, 9000, 20_000])
 def test_writes_that_stop_half_way(clean: Path, fog: Path, tmp_path: Path, size: int) -> None:
     with largest_file(size):
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), "File too large")
+        fails(StoreError, lambda: write_shifted_roots(options(clean, tmp_path / "o"), workers=0), "File too large")
     whole = tree(fog)
     for name, data in tree(tmp_path / "o").items():
         if "samples" in name or "sweeps" in name:
             assert data == whole[name.removeprefix("fog-3/")]
-    materialise(options(clean, tmp_path / "o"), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == whole
 
 
@@ -242,8 +259,8 @@ def test_a_worker_that_dies_is_one_line(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(run, "make_shard", _die)
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=2), "the process ended")
-    materialise(options(clean, tmp_path / "o"), workers=0)
+        fails(StoreError, lambda: write_shifted_roots(options(clean, tmp_path / "o"), workers=2), "the process ended")
+    write_shifted_roots(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == tree(fog)
 
 
@@ -325,7 +342,7 @@ def test_same_size_other_bytes(root: Path) -> None:
 
 
 def test_a_link_to_another_file(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", sweeps=False), workers=0)[0].root
+    root = write_shifted_roots(options(clean, tmp_path / "o", sweeps=False), workers=0)[0].root
     name = first(root, state="linked")
     other = max(n for n, r in lines(root).items() if r["state"] == "linked" and r["kind"] == "camera")
     (root / name).unlink()
@@ -361,7 +378,7 @@ def test_a_broken_page(root: Path, text: str) -> None:
 
 def test_nothing_is_left_open_or_changed(clean: Path, tmp_path: Path) -> None:
     before, threads = tree(clean), cv2.getNumThreads()
-    materialise(options(clean, tmp_path / "o", "fog", "gaussian", "scale", scenes=SCENES[:1]), workers=0)
+    write_shifted_roots(options(clean, tmp_path / "o", "fog", "gaussian", "scale", scenes=SCENES[:1]), workers=0)
     assert tree(clean) == before
     assert cv2.getNumThreads() == threads
     assert len(work._DATA) == 1

@@ -14,7 +14,7 @@ from helpers.killing import kill_9, started_by, wait_until_ended
 from helpers.tiny import make_tiny
 
 from ssad.core.errors import StoreError
-from ssad.recorders.shifted import Options, check_manifest, materialise, verify
+from ssad.recorders.shifted import Options, check_manifest, verify, write_shifted_roots
 from ssad.recorders.shifted.manifest import read_lines
 
 VERSION = "v1.0-mini"
@@ -22,10 +22,10 @@ SHIFTS = ("snow", "scale")
 DRIVER = """
 import sys
 from pathlib import Path
-from ssad.recorders.shifted import Options, materialise
+from ssad.recorders.shifted import Options, write_shifted_roots
 if __name__ == "__main__":
     options = Options(Path(sys.argv[1]), Path(sys.argv[2]), "v1.0-mini", ("snow", "scale"), ("random",))
-    materialise(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))
+    write_shifted_roots(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))
 """
 
 
@@ -39,7 +39,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unbroken(clean: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | bytes]:
     """The bytes of a run that nobody disturbed."""
     out = tmp_path_factory.mktemp("unbroken") / "o"
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
+    write_shifted_roots(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     return tree(out)
 
 
@@ -127,7 +127,7 @@ def test_what_a_killed_run_made_is_not_made_again(
         for lines in (root / "manifest").glob("*.jsonl"):
             kept |= {root / name: (root / name).stat().st_ino for name in read_lines(lines)}
     assert len(kept) >= 25
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
+    write_shifted_roots(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     assert {path: path.stat().st_ino for path in kept} == kept
     assert tree(out) == unbroken
 
@@ -146,5 +146,5 @@ def test_workers_end_with_the_process_that_started_them(
     run.kill()
     run.communicate()
     wait_until_ended(workers)
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
+    write_shifted_roots(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     assert tree(out) == unbroken

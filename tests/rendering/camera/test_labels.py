@@ -16,7 +16,7 @@ from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import visibility_token
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.labels import Labels, extents, label_picture, visible_share
+from ssad.rendering.camera.labels import Labels, extents, label_image, visible_share
 from ssad.rendering.camera.render import PLAIN, Rendering, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.meshes.mesh import Material, box
@@ -45,7 +45,7 @@ def at(x: float, y: float = 0.0, *, mesh: int = 0, tag: int = 1, yaw: float = 0.
 def seen(*things: SceneObject, scale: int = 2) -> tuple[Labels, Rendering]:
     view = View(CAMERA, EYE, things)
     picture = render(stage(), [view], scale=scale, quality=PLAIN)
-    return label_picture(stage(), view, picture, scale=scale), picture
+    return label_image(stage(), view, picture, scale=scale), picture
 
 
 def empty_picture() -> Rendering:
@@ -81,7 +81,7 @@ def test_the_box_is_the_projection(x: float, y: float) -> None:
     assert labels.box[0].tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     assert labels.pixels[0] == len(rows)
     assert labels.share[0] > 0.99
-    assert labels.inside[0] == 1.0
+    assert labels.image_share[0] == 1.0
 
 
 @pytest.mark.parametrize(("x", "y"), [(5.0, 0.0), (11.0, 1.1)])
@@ -116,7 +116,7 @@ def test_half_hidden_is_half_visible(x: float) -> None:
     assert labels.tag.tolist() == [1, 2]
     assert labels.share[0] == pytest.approx(0.5, abs=0.03)
     assert labels.share[1] > 0.97
-    assert labels.inside.tolist() == [1.0, 1.0]
+    assert labels.image_share.tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("number", range(len(BODIES)))
@@ -147,21 +147,21 @@ def test_the_part_outside_the_picture_does_not_count_as_hidden() -> None:
     assert labels.share[0] > 0.98
     width = FOCAL / x
     flank = FOCAL * (0.64 - (0.64 * x - 1) / (x + 0.5))  # from the border to where the flank ends
-    assert labels.inside[0] == pytest.approx(flank / (flank + width), abs=0.03)
+    assert labels.image_share[0] == pytest.approx(flank / (flank + width), abs=0.03)
 
 
 def test_a_thing_beside_the_camera_is_cut_at_the_near_plane() -> None:
     labels, _ = seen(at(1.0, 2.2, mesh=2))
     assert len(labels) == 1
     assert 0.9 < labels.share[0] <= 1.0
-    assert 0.0 < labels.inside[0] < 0.6
+    assert 0.0 < labels.image_share[0] < 0.6
 
 
 def test_what_is_behind_or_beside_has_no_label() -> None:
     things = (at(-8.0, tag=3), at(10.0, 30.0, tag=4), at(10.0, tag=5), at(14.0, tag=6), at(10.0, 3.0, tag=0))
     view = View(CAMERA, EYE, things)
     picture = render(stage(), [view], quality=PLAIN)
-    assert label_picture(stage(), view, picture).tag.tolist() == [5]
+    assert label_image(stage(), view, picture).tag.tolist() == [5]
     shares = visible_share(stage(), view, picture)
     assert list(shares) == [3, 4, 5, 6]
     assert (shares[3], shares[4], shares[6]) == (0.0, 0.0, 0.0)
@@ -179,15 +179,15 @@ def test_things_of_one_tag_are_one() -> None:
 def test_labels_of_the_second_picture() -> None:
     views = [View(CAMERA, EYE, (at(10.0, tag=8),)), View(CAMERA, EYE, (at(20.0, tag=9),))]
     picture = render(stage(), views, quality=PLAIN)
-    assert label_picture(stage(), views[1], picture, 1).tag.tolist() == [9]
+    assert label_image(stage(), views[1], picture, 1).tag.tolist() == [9]
 
 
 def test_nothing_there() -> None:
     for view in (View(CAMERA, EYE), View(CAMERA, EYE, (at(-5.0),))):
-        labels = label_picture(stage(), view, empty_picture())
+        labels = label_image(stage(), view, empty_picture())
         assert len(labels) == 0
         assert labels.box.shape == (0, 4)
-        assert labels.share.shape == labels.inside.shape == labels.pixels.shape == (0,)
+        assert labels.share.shape == labels.image_share.shape == labels.pixels.shape == (0,)
     assert visible_share(stage(), View(CAMERA, EYE), empty_picture()) == {}
 
 
@@ -205,11 +205,11 @@ def test_a_picture_of_another_view_is_refused() -> None:
     view = View(CAMERA, EYE, (at(10.0, tag=8),))
     picture = render(stage(), [view], quality=PLAIN)
     with pytest.raises(ConfigError, match="shows tag 8"):
-        label_picture(stage(), View(CAMERA, EYE, (at(10.0, tag=2),)), picture)
+        label_image(stage(), View(CAMERA, EYE, (at(10.0, tag=2),)), picture)
     with pytest.raises(ConfigError, match="no picture 1"):
-        label_picture(stage(), view, picture, 1)
+        label_image(stage(), view, picture, 1)
     with pytest.raises(ConfigError, match="640 x 360"):
-        label_picture(stage(), View(Camera.typical(320, 180), EYE, view.objects), picture)
+        label_image(stage(), View(Camera.typical(320, 180), EYE, view.objects), picture)
 
 
 def test_levels_of_visibility() -> None:

@@ -17,7 +17,7 @@ from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera.lamps import SceneLamp, lamp_strength, lit_circle, nearby_lights, own_lamps
 from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render, scene_light
-from ssad.rendering.camera.scene import RenderScene, SceneObject, collect
+from ssad.rendering.camera.scene import RenderScene, SceneObject, collect_objects
 from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
@@ -129,7 +129,7 @@ def test_what_stands_in_its_way_keeps_light_off(scene: RenderScene) -> None:
     free = lamp_light(scene, view, quality=PLAIN)
     block = SceneObject(1, np.eye(4), tag=1)
     seen = replace(view, objects=(*view.objects, block))
-    hidden = replace(view, objects=(*view.objects, replace(block, hidden=True)))
+    hidden = replace(view, objects=(*view.objects, replace(block, is_hidden=True)))
     ghost = lamp_light(scene, hidden, quality=PLAIN)
     assert ghost[47, 47].max() == 0.0, "a hidden thing casts, and the ground below it is seen"
     # the edge of the shadow: the lamp is 8 m up, the top of the block 1.7 m, its half length 2 m
@@ -164,7 +164,7 @@ def test_bodies_keep_the_sky_from_the_ground(scene: RenderScene) -> None:
     """The share that a rectangle hides from a point below its middle, after the configuration factor."""
     weather = SceneWeather(sun_height=0.0, clouds=1.0)  # no sun
     base = replace(above(20.0), weather=weather)
-    hidden = replace(base, objects=(*base.objects, SceneObject(1, np.eye(4), tag=1, hidden=True)))
+    hidden = replace(base, objects=(*base.objects, SceneObject(1, np.eye(4), tag=1, is_hidden=True)))
     free, under = (render(scene, [v], surface=True).surface for v in (base, hidden))
     off = render(scene, [hidden], quality=RenderQuality(contact=False), surface=True).surface
     assert free is not None
@@ -200,7 +200,7 @@ def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
 
 def lit_lamps(scene: RenderScene, view: View) -> Any:
     """The lamps of a view as the kernels get them."""
-    near = nearby_lights(scene, [view], collect([view.objects]))
+    near = nearby_lights(scene, [view], collect_objects([view.objects]))
     return near.lamps.numpy()[: len(set(near.lamp_list.numpy()))] if near.lamp_start.numpy()[-1] else []
 
 
@@ -217,8 +217,8 @@ def test_by_night_lamps_are_on(scene: RenderScene) -> None:
     assert tail["place"][0] < 8.5
     dusk = lit_lamps(scene, replace(view, weather=SceneWeather(sun_height=0.02)))
     assert dusk["light"] == pytest.approx(lit_lamps(scene, view)["light"] * lamp_strength(0.02), rel=1e-5)
-    assert not len(lit_lamps(scene, replace(view, objects=(replace(car, lit=False),))))
-    lit, off = (render(scene, [replace(view, objects=(view.objects[0], c))]) for c in (car, replace(car, lit=False)))
+    assert not len(lit_lamps(scene, replace(view, objects=(replace(car, is_lit=False),))))
+    lit, off = (render(scene, [replace(view, objects=(view.objects[0], c))]) for c in (car, replace(car, is_lit=False)))
     assert lit.radiance[0, 50:].sum() > 1.05 * off.radiance[0, 50:].sum()
     assert not own_lamps(np.eye(4), SceneWeather())
     beam = own_lamps(np.eye(4), NIGHT)
@@ -232,7 +232,7 @@ def test_fine_shadows_are_finer(scene: RenderScene) -> None:
     """The edge of the shadow of a block, against the geometry: within a few centimetres."""
     weather = SceneWeather(sun_height=0.8, sun_heading=0.0, clouds=0.0)
     camera = Camera(256, 256, np.array([[512.0, 0, 128.0], [0, 512.0, 128.0], [0, 0, 1]]))
-    things = (SceneObject(0, np.eye(4)), SceneObject(1, np.eye(4), tag=1, hidden=True))
+    things = (SceneObject(0, np.eye(4)), SceneObject(1, np.eye(4), tag=1, is_hidden=True))
     view = View(camera, at(-3.0, 0.0, 10.0, DOWN), things, weather, focus=(-2.0, 0.0))
     sun = np.array(scene_light(weather)[0][0])
     edge = -2.0 - 1.7 * sun[0] / sun[2]  # of the shadow of the upper edge, on the far side of the sun

@@ -17,7 +17,15 @@ from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera.render import PLAIN, Rendering, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
-from ssad.rendering.camera.texture import PRINTABLE, levels_of, paint_mask, printable, pyramid, retexture, texture_taps
+from ssad.rendering.camera.texture import (
+    PRINTABLE,
+    levels_of,
+    paint_mask,
+    pyramid,
+    retexture,
+    texture_taps,
+    to_printable,
+)
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 
@@ -213,4 +221,4 @@ def test_wrong_textures_are_refused_in_one_line(scene: RenderScene) -> None:
         with pytest.raises(ConfigError):
             wrong_layer()
     low, high = PRINTABLE
-    assert printable(torch.tensor([-1.0, 0.0, 1.0, 7.0])).tolist() == pytest.approx([low, low, high, high])
+    assert to_printable(torch.tensor([-1.0, 0.0, 1.0, 7.0])).tolist() == pytest.approx([low, low, high, high])

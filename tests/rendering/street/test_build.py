@@ -71,7 +71,7 @@ def from_lanes(graph: LaneGraph, xy: npt.NDArray[np.float64]) -> npt.NDArray[np.
     lane, _, lateral, inside = LaneQuery(graph).nearest(xy, STREETS)
     gap = np.full(len(xy), 3.0)
     known = np.flatnonzero(lane >= 0)
-    width = np.array([graph.width[graph.points(int(i))].max() for i in range(graph.lanes)])
+    width = np.array([graph.width[graph.points(int(i))].max() for i in range(graph.lane_count)])
     gap[known] = np.abs(lateral[known]) - 0.5 * width[lane[known]]
     gap[inside] = -1.0
     return gap

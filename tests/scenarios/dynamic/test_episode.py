@@ -21,7 +21,7 @@ from ssad.core.types import (
     TrafficPlan,
 )
 from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
-from ssad.scenarios.dynamic.episode import _start
+from ssad.scenarios.dynamic.episode import _pose_beside_route
 from ssad.world.models import model
 from ssad.world.roads import load_town
 
@@ -78,9 +78,9 @@ def test_the_start_on_a_route(forward: float, left: float, turn: float, pose: tu
     ones = np.ones(5, np.float32)
     xy = np.stack([[0, 2, 4, 6, 8], np.zeros(5)], axis=1).astype(np.float32)
     route = Route(xy, np.array([0, 0, 0, math.pi / 4, math.pi / 2], np.float32), np.zeros(5, np.int32), ones, ones)
-    found = _start(route, forward, left, turn)
+    found = _pose_beside_route(route, forward, left, turn)
     assert (found.x, found.y, found.yaw) == pytest.approx(pose, abs=1e-6)
-    half = _start(replace(route, spacing=2.0), 2.0 * forward, left, turn)
+    half = _pose_beside_route(replace(route, spacing=2.0), 2.0 * forward, left, turn)
     assert (half.x, half.y, half.yaw) == pytest.approx((found.x, found.y, found.yaw), abs=1e-6)
 
 

@@ -17,7 +17,7 @@ from ssad.core.generators import Base, Generator, Outcome, Proposal
 from ssad.core.types import Bool, Controller, Pose
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios, save_scenarios
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, generator_list, scenario_of, search
 from ssad.scenarios.dynamic.outcome import measure
 from ssad.world.roads import load_town
@@ -83,7 +83,7 @@ def test_a_search_goes_on_from_what_is_known(bases: list[Base]) -> None:
         generator = generator_factory("random")(bases, seeds=[1, 2], budget=8)
         counting = Counting(lambda: make_system("blind"), make_system)
         Counting.driven = []
-        return search(generator, bases, counting, budget=budget, batch=4, known=known), sum(Counting.driven)
+        return search(generator, bases, counting, budget=budget, batch=4, known_outcomes=known), sum(Counting.driven)
 
     whole, driven = run(())
     assert driven == 16
@@ -119,7 +119,7 @@ def test_what_cannot_be_built_is_a_failed_outcome(bases: list[Base]) -> None:
     inside = dataclasses.replace(base.scenario, placements=(Pose(*base.trace.route[0].tolist(), 0.0),))
     failed, ran = trials().run([(base, Proposal(inside)), (base, Proposal(base.scenario))])
     assert "stands in the" in failed.failure
-    assert not failed.valid
+    assert not failed.is_valid
     assert failed.gap is None
     assert failed.danger == -100.0
     assert ran.failure == ""
@@ -169,7 +169,7 @@ def test_who_still_moves_at_the_end_of_a_recording_brakes_to_a_stop(natural: Bas
         trace, **{n: getattr(trace, n)[:60] for n in ("x", "y", "yaw", "speed", "active", "contact")}
     )
     moving = [a for a in range(1, len(trace.names)) if cut.active[-1, a] and cut.speed[-1, a] > 3.5]
-    scenario = frozen(natural.episode, cut)
+    scenario = freeze_episode(natural.episode, cut)
     assert moving
     for agent in moving:
         actor = next(a for a in scenario.actors if a.name == trace.names[agent])

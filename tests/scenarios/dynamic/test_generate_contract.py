@@ -13,7 +13,7 @@ from ssad.core.generators import Base, Generator, Outcome
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.generate import GENERATORS, Trials, generator_factory
-from ssad.scenarios.dynamic.logged.near_miss import moved, near_misses
+from ssad.scenarios.dynamic.logged.near_miss import near_misses, perturb_motion
 from ssad.scenarios.dynamic.policy.l2c import _Distribution
 from ssad.scenarios.dynamic.transition.motion import KNOTS, TimedPath
 from ssad.world.roads import load_town
@@ -93,10 +93,10 @@ def test_a_near_miss_is_found_and_becomes_a_hit() -> None:
     assert miss.agent == 1
     # bodies of 4 m x 2 m overlap as long as centres are within 3 m of each other on both ways
     assert 0.6 < miss.late < 1.5
-    rows = moved(trace, miss, shift=0.0, aside=0.0)
+    rows = perturb_motion(trace, miss, shift=0.0, lateral=0.0)
     apart = np.hypot(rows[:, 1] - 8.0 * step, rows[:, 2])
     assert apart.min() < 3.7
     before = np.hypot(40.0 - 8.0 * step, -52.0 + 8.0 * step)
     assert before.min() > 6.0
-    later = moved(trace, miss, shift=1.0, aside=0.0)
+    later = perturb_motion(trace, miss, shift=1.0, lateral=0.0)
     assert (np.hypot(later[:, 1] - 8.0 * step, later[:, 2])).min() > apart.min() + 1.0

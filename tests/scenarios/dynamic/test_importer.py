@@ -389,7 +389,7 @@ def test_routes_that_no_list_of_frea_names_come_in_too(data_dir: Path, tmp_path:
     entries = [{"data_id": k, "scenario_id": 9, "route_id": k, "parameters": None} for k in range(28)]
     (tmp_path / "scenario_type" / "all.json").write_text(json.dumps(entries))
     left_out: list[str] = []
-    assert len({s.route for s in import_routes(tmp_path, left_out=left_out)}) == 28
+    assert len({s.route for s in import_routes(tmp_path, omissions=left_out)}) == 28
     assert left_out == []
 
 
@@ -449,7 +449,7 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
     ]
     (inside / "config" / "scenario_type" / "standard.json").write_text(json.dumps(entries))
     left_out: list[str] = []
-    found = import_routes(tmp_path / "SafeBench", left_out=left_out)
+    found = import_routes(tmp_path / "SafeBench", omissions=left_out)
     assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
     assert [line.rpartition("/")[2] for line in left_out] == [
         "standard.json: entry 0: unknown scenario_id 0; known: 1 to 9",
@@ -460,7 +460,7 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
         import_routes(tmp_path / "SafeBench")
     (inside / "scenario_data" / "route" / "scenario_05_routes" / "scenario_05_route_03.xml").write_text("<routes/>")
     with pytest.raises(FormatError, match="none of its routes can be read; the first: "):
-        import_routes(tmp_path / "SafeBench", left_out=[])
+        import_routes(tmp_path / "SafeBench", omissions=[])
 
 
 def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_stands_for(tmp_path: Path) -> None:
@@ -473,10 +473,10 @@ def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_sta
     ]
     (lists / "human.json").write_text(json.dumps(rows))
     (lists / "advsim.json").write_text(json.dumps([row | {"parameters": "5.npy"} for row in rows]))
-    (plain,) = import_routes(folder, left_out=[])
+    (plain,) = import_routes(folder, omissions=[])
     assert plain.parameters == {}
     left_out: list[str] = []
-    found = import_routes(lists / "human.json", left_out=left_out)
+    found = import_routes(lists / "human.json", omissions=left_out)
     assert [s.parameters for s in found] == [
         {"speed": 8.0, "trigger_distance": 31.0},
         {"speed": 12.5, "trigger_distance": 39.0},

@@ -30,17 +30,17 @@ from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, ON
 from ssad.scenarios.dynamic.knowledge._meeting import ego_times, meeting_place, time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
     LanePosition,
-    ahead,
+    adjacent_place,
     bending_route,
-    beside,
-    go,
     junction_span,
     lane_path,
+    make_drive_phase,
+    place_ahead,
     polyline_route,
     project,
-    scripted,
-    standing,
-    straightest,
+    scripted_agent,
+    standing_agent,
+    straightest_successor,
     to_outermost,
     trigger_index,
     trigger_place,
@@ -122,7 +122,7 @@ def test_parked_and_oncoming_car(crossroads: LaneGraph, routes: Any) -> None:
 
 
 def test_a_missing_left_lane_is_an_error(crossroads: LaneGraph, routes: Any) -> None:
-    graph = replace(crossroads, left=np.full(crossroads.lanes, -1, np.int32))
+    graph = replace(crossroads, left=np.full(crossroads.lane_count, -1, np.int32))
     for kind in ("LaneChanging", "VehiclePassing"):
         with pytest.raises(RouteError, match="needs a lane to the left"):
             build(scenario(kind), graph, routes.straight)
@@ -361,11 +361,11 @@ def test_signals_of_a_junction_that_the_route_does_not_pass(crossroads: LaneGrap
 def test_lanes_of_the_ego_from_the_south(crossroads: LaneGraph) -> None:
     inner, outer = lane_of(crossroads, 13, 1), lane_of(crossroads, 13, 2)
     assert inner == 0
-    assert beside(crossroads, LanePosition(outer, 30.0), "left") == LanePosition(inner, pytest.approx(30.0))
-    assert beside(crossroads, LanePosition(inner, 30.0), "right") == LanePosition(outer, pytest.approx(30.0))
-    opposite = beside(crossroads, LanePosition(inner, 30.0), "left")
+    assert adjacent_place(crossroads, LanePosition(outer, 30.0), "left") == LanePosition(inner, pytest.approx(30.0))
+    assert adjacent_place(crossroads, LanePosition(inner, 30.0), "right") == LanePosition(outer, pytest.approx(30.0))
+    opposite = adjacent_place(crossroads, LanePosition(inner, 30.0), "left")
     assert opposite == LanePosition(lane_of(crossroads, 13, -1), pytest.approx(70.0))
-    assert beside(crossroads, LanePosition(lane_of(crossroads, 13, 3), 30.0), "right") is None
+    assert adjacent_place(crossroads, LanePosition(lane_of(crossroads, 13, 3), 30.0), "right") is None
     assert width_at(crossroads, LanePosition(inner, 30.0)) == 3.5
 
 
@@ -385,25 +385,25 @@ def test_a_point_is_projected_onto_a_bend(crossroads: LaneGraph) -> None:
 def test_turns_at_the_crossroads(crossroads: LaneGraph) -> None:
     turns = {road: turn_of(crossroads, lane_of(crossroads, road, k)) for road, k in ((132, -1), (133, -1), (131, -2))}
     assert turns == pytest.approx({132: 0.0, 133: math.pi / 2, 131: -math.pi / 2}, abs=0.12)
-    assert straightest(crossroads, 0) == lane_of(crossroads, 132, -1)
-    assert straightest(crossroads, lane_of(crossroads, 11, -1)) is None
+    assert straightest_successor(crossroads, 0) == lane_of(crossroads, 132, -1)
+    assert straightest_successor(crossroads, lane_of(crossroads, 11, -1)) is None
     # where no lane for cars goes on, another one does
     kind = crossroads.kind.copy()
     kind[lane_of(crossroads, 132, -1)] = LaneType.BIKING
-    assert straightest(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 133, -1)
+    assert straightest_successor(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 133, -1)
     kind[lane_of(crossroads, 133, -1)] = LaneType.BIKING
-    assert straightest(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 132, -1)
+    assert straightest_successor(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 132, -1)
 
 
 def test_places_ahead(crossroads: LaneGraph) -> None:
     inside, after = lane_of(crossroads, 132, -1), lane_of(crossroads, 11, -1)
-    assert ahead(crossroads, LanePosition(0, 60.0), 40.0) == LanePosition(0, 100.0)
-    assert ahead(crossroads, LanePosition(0, 60.0), 45.0) == LanePosition(inside, 5.0)
-    assert ahead(crossroads, LanePosition(0, 60.0), 75.0) == LanePosition(after, 5.0)
-    assert ahead(crossroads, LanePosition(0, 60.0), 500.0) == LanePosition(after, 100.0)  # the end of the road
-    assert ahead(crossroads, LanePosition(0, 60.0), 75.0, stop_at_junction=True) == LanePosition(0, 100.0)
+    assert place_ahead(crossroads, LanePosition(0, 60.0), 40.0) == LanePosition(0, 100.0)
+    assert place_ahead(crossroads, LanePosition(0, 60.0), 45.0) == LanePosition(inside, 5.0)
+    assert place_ahead(crossroads, LanePosition(0, 60.0), 75.0) == LanePosition(after, 5.0)
+    assert place_ahead(crossroads, LanePosition(0, 60.0), 500.0) == LanePosition(after, 100.0)  # the end of the road
+    assert place_ahead(crossroads, LanePosition(0, 60.0), 75.0, stop_at_junction=True) == LanePosition(0, 100.0)
     # one who is in the junction leaves it
-    assert ahead(crossroads, LanePosition(inside, 20.0), 15.0, stop_at_junction=True) == LanePosition(after, 5.0)
+    assert place_ahead(crossroads, LanePosition(inside, 20.0), 15.0, stop_at_junction=True) == LanePosition(after, 5.0)
 
 
 def test_a_lanes_path_goes_on_over_the_lanes_that_follow(crossroads: LaneGraph) -> None:
@@ -530,9 +530,11 @@ def test_a_walker_whose_road_begins_in_a_junction_leaves_it(crossroads: LaneGrap
 
 def test_agents_that_wait_and_agents_that_stand(crossroads: LaneGraph) -> None:
     pose = Pose(1.0, 2.0, 0.5)
-    agent = scripted("a", "car", pose, [go(3.0, 20.0), go(7.0, 20.0), go(5.0, 20.0)])
+    agent = scripted_agent(
+        "a", "car", pose, [make_drive_phase(3.0, 20.0), make_drive_phase(7.0, 20.0), make_drive_phase(5.0, 20.0)]
+    )
     assert (agent.target_speed, agent.speed, agent.pose) == (7.0, 0.0, pose)
-    still = standing("b", "cone", pose)
+    still = standing_agent("b", "cone", pose)
     assert (still.target_speed, still.controller, still.phases) == (0.0, Controller.NONE, ())
 
 

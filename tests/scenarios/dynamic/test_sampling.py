@@ -32,10 +32,10 @@ from ssad.scenarios.dynamic import (
     save_scenarios,
     scenario_type,
 )
-from ssad.scenarios.dynamic.episode import _start
+from ssad.scenarios.dynamic.episode import _pose_beside_route
 from ssad.scenarios.dynamic.knowledge import _meeting
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route, trigger_index
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 from ssad.world.roads import load_town
 
@@ -258,12 +258,12 @@ def test_the_ego_starts_where_its_parameters_say() -> None:
         np.ones(3, np.float32),
         np.ones(3, np.float32),
     )
-    pose = _start(bend, 0.5, 0.0, 0.0)
+    pose = _pose_beside_route(bend, 0.5, 0.0, 0.0)
     assert (pose.x, pose.y, abs(pose.yaw)) == pytest.approx((0.5, 0.0, math.pi), abs=1e-6)
-    assert _start(bend, 99.0, 0.0, 0.0) == Pose(1.0, 1.0, -2.0)
+    assert _pose_beside_route(bend, 99.0, 0.0, 0.0) == Pose(1.0, 1.0, -2.0)
     # nominally just the route's first point: pi as a float32 is more than pi, and stays so
     west = dataclasses.replace(bend, yaw=np.full(3, np.pi, np.float32))
-    assert _start(west, 0.0, 0.0, 0.0).yaw == float(np.float32(np.pi))
+    assert _pose_beside_route(west, 0.0, 0.0, 0.0).yaw == float(np.float32(np.pi))
 
 
 def boxes(episode: Episode) -> np.ndarray:
@@ -351,7 +351,7 @@ def test_a_second_draw_searches_nothing(monkeypatch: pytest.MonkeyPatch) -> None
     def never(*arguments: object, **options: object) -> None:
         raise AssertionError("searched again")
 
-    monkeypatch.setattr(_meeting, "_meet", never)
+    monkeypatch.setattr(_meeting, "_best_start", never)
     monkeypatch.setattr("ssad.world.roads.route_along", never)
     for scenario, first in zip(scenarios, before, strict=True):
         second = build(scenario, 1)
@@ -376,7 +376,7 @@ def test_what_episodes_share_cannot_be_changed() -> None:
 def test_answers_are_kept_by_map_and_route(crossroads: LaneGraph, routes: Any) -> None:
     calls = []
 
-    @remembered(2)
+    @cached_by_identity(2)
     def ask(graph: LaneGraph, route: Route, number: int) -> int:
         calls.append((graph, route, number))
         if number < 0:

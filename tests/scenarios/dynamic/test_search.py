@@ -15,7 +15,7 @@ from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.generate import GENERATORS, generator_factory
 from ssad.scenarios.dynamic.sampling import sampling_ranges
 from ssad.scenarios.dynamic.search.bayesian import expected_improvement, predict
-from ssad.scenarios.dynamic.search.box import Box
+from ssad.scenarios.dynamic.search.box import ParameterBox
 from ssad.world.roads import load_town
 
 SEARCHES = [name for name, where in GENERATORS.items() if ".search." in where]
@@ -33,7 +33,7 @@ def outcome_of(proposal: Proposal, danger: float) -> Outcome:
 
 
 def point(scenario: Scenario) -> F64:
-    box = Box.of(SCENARIO)
+    box = ParameterBox.of(SCENARIO)
     return np.array([(scenario.parameters[n] - low) / (high - low) for n, (low, high) in box.ranges.items()])
 
 
@@ -63,7 +63,7 @@ def test_a_search_stays_in_the_box_and_depends_on_its_seed_alone(name: str, base
     assert not np.array_equal(first, other)
     kind = scenario_type(SCENARIO.type)
     for row in first:
-        scenario = Box.of(SCENARIO).at(row)
+        scenario = ParameterBox.of(SCENARIO).scenario_at(row)
         assert kind.values(scenario.parameters)["ego_speed"] == 0.0  # the ego's start is not the generator's
         build_episode(scenario, base.graph, seed=0)
 
@@ -115,7 +115,7 @@ def test_the_generations_of_cma_es_do_not_depend_on_the_batch(batch: int, base: 
 def test_a_scenario_without_parameters_of_others_is_told_in_a_line(base: Base) -> None:
     custom = dataclasses.replace(base.scenario, type="Custom", parameters={})
     with pytest.raises(ConfigError, match=r"Custom has no parameters of other agents to search; take one of .* king"):
-        Box.of(custom)
+        ParameterBox.of(custom)
 
 
 def test_a_gaussian_process_goes_through_what_it_knows() -> None:
@@ -140,7 +140,7 @@ def test_a_value_beyond_what_is_searched_is_kept_and_searches_begin_at_the_neare
     (plain,) = load_scenarios("LaneChanging/00")
     fast = dataclasses.replace(plain, parameters={"leader_speed": 18.0})  # searched: 8 to 16 m/s; allowed: up to 20
     assert sampling_ranges(fast)["leader_speed"] == (16.5, 18.0)
-    box = Box.of(fast)
+    box = ParameterBox.of(fast)
     nominal = dict(zip(box.ranges, box.nominal(), strict=True))
     assert nominal["leader_speed"] == 1.0
-    assert box.at(box.nominal()).parameters["leader_speed"] == 16.0
+    assert box.scenario_at(box.nominal()).parameters["leader_speed"] == 16.0

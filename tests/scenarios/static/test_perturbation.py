@@ -19,8 +19,8 @@ from ssad.core.images import read_image
 from ssad.core.types import Controller, EpisodeLimits
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
-from ssad.experiments.perception.physical.lit_images import LightableClips
-from ssad.recorders.target_images import record_clips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering import onboard
 from ssad.rendering.episode_scene import EpisodeScene
@@ -136,8 +136,8 @@ def test_it_acts_on_recorded_scenes(tiny_set: Path, tmp_path: Path) -> None:
                 perturbation.on_scene(recorded, victim)
             continue
         presentation = perturbation.on_scene(recorded, victim)
-        assert presentation.look is not None
-        images = presentation.look(frames)
+        assert presentation.load_images is not None
+        images = presentation.load_images(frames)
         assert [image.shape for image in images] == [image.shape for image in clean], name
         assert {image.dtype for image in images} == {np.dtype(np.uint8)}
         assert dict(presentation.notes()) is not None
@@ -158,7 +158,7 @@ def targets(shared: Shared) -> dict[str, Path]:
             parsed = parse_target(target)
             mode = "drive" if isinstance(parsed, TargetCar) else "orbit"
             folder = out / target.replace(":", "-")
-            record_clips(
+            record_target_images(
                 TargetRecording(
                     folder, (("Twinford", 1),), (), size=320, behind=8.0, target=parsed, mode=mode, distances=(6.0,)
                 ),
@@ -192,7 +192,7 @@ def test_it_acts_on_a_recorded_target(name: str, targets: dict[str, Path]) -> No
 
 def on_target(perturbation: Perturbation, folder: Path) -> float:
     """Mean change of the images by a perturbation, code values."""
-    images = LightableClips(folder, 1)
+    images = RelightableTargetImages(folder, 1)
     changed = list(perturbation.on_target(images))
     clean = list(images.clean())
     assert [drive for drive, _, _ in changed] == [drive for drive, _, _ in clean]

@@ -63,7 +63,7 @@ def test_a_target_is_compared_with_its_clean_images() -> None:
 
 def test_a_perturbed_scene_is_unmodified_unless_said() -> None:
     scene = PerturbedScene()
-    assert (scene.look, scene.ahead, scene.images_at_once) == (None, True, 0)
+    assert (scene.load_images, scene.ahead, scene.images_at_once) == (None, True, 0)
     assert dict(scene.notes()) == {}
     assert scene.done() is None  # type: ignore[func-returns-value]
 

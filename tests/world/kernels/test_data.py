@@ -10,7 +10,7 @@ import pytest
 
 from ssad.core.types import ENDS, PhaseTrigger
 from ssad.world import kernels
-from ssad.world.kernels.data import End, When
+from ssad.world.kernels.data import End, PhaseCondition
 
 CODED = ("kind", "controller", "active", "end", "contact", "who", "light")
 SOURCES = sorted(Path(kernels.__file__).parent.glob("*.py"))
@@ -18,7 +18,9 @@ SOURCES = sorted(Path(kernels.__file__).parent.glob("*.py"))
 
 def test_every_condition_of_a_phase_has_a_code() -> None:
     kinds = get_args(get_type_hints(PhaseTrigger)["kind"])
-    assert [when.name.lower() for when in When] == sorted(kinds, key=lambda kind: When[kind.upper()])
+    assert [when.name.lower() for when in PhaseCondition] == sorted(
+        kinds, key=lambda kind: PhaseCondition[kind.upper()]
+    )
 
 
 def test_every_end_has_a_name() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import MapError
-from ssad.core.lane_graph import LaneGraph, SignKind, equal
+from ssad.core.lane_graph import LaneGraph, SignKind, are_equal
 from ssad.core.types import LaneType
 from ssad.world.roads import bake, import_map, load_graph, load_town, town_names
 from ssad.world.roads import bake as bake_function
@@ -230,7 +230,7 @@ def test_the_small_map_of_the_table_is_good_before_it_is_broken(tmp_path: Path) 
     path.write_text(ROAD, encoding="utf-8")
     graph = bake(path)
     assert graph.name == "road"
-    assert graph.lanes == 1
+    assert graph.lane_count == 1
     assert graph.length[0] == pytest.approx(10.0, abs=0.01)
     assert graph.xy[:, 1] == pytest.approx(-1.75)
     assert nearest_all(graph, (5.0, -1.75), (LaneType.DRIVING,))[2] == pytest.approx(-1.75, abs=1e-3)
@@ -299,7 +299,7 @@ def test_import_makes_a_town(tmp_path: Path, ssad_home: Path) -> None:
     assert town_names()["Elsewhere"] == str(stored)
     graph = load_town("Elsewhere")
     assert graph.name == "Elsewhere"
-    assert equal(graph, load_graph(stored))
+    assert are_equal(graph, load_graph(stored))
     assert np.array_equal(graph.xy, load_town(str(path)).xy)
     assert sorted(p.name for p in stored.parent.iterdir()) == ["Elsewhere.npz", "Elsewhere.xodr"]
     for name in ("../x", "a/b", ".hidden"):

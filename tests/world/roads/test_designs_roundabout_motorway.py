@@ -106,12 +106,14 @@ def test_motorway_has_lanes_and_ramps() -> None:
     fast = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.speed_limit > MOTORWAY))
     count = {}
     for lane in fast.tolist():
-        assert graph.divided(lane)
+        assert graph.is_divided(lane)
         key = int(graph.road[lane]), bool(graph.lane_id[lane] > 0)
         count[key] = count.get(key, 0) + 1
     assert sorted(count.values()) == [2, 2, 2, 2, 3, 3]
     street = (graph.kind == LaneType.DRIVING) & (graph.junction < 0)
-    ramps = [i for i in np.flatnonzero(street & ~np.isin(np.arange(graph.lanes), fast)).tolist() if graph.divided(i)]
+    ramps = [
+        i for i in np.flatnonzero(street & ~np.isin(np.arange(graph.lane_count), fast)).tolist() if graph.is_divided(i)
+    ]
     assert len(ramps) == 4
     joins = [bool(np.isin(graph.successors(int(graph.successors(i)[0])), fast).any()) for i in ramps]
     assert sum(joins) == 2  # two on, two off

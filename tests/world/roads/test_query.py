@@ -69,7 +69,7 @@ def test_nearest_is_brute_force_on_carla_towns(carla_home: Path, name: str) -> N
 def test_lane_points_are_inside_their_lane(name: str) -> None:
     graph = built_in(name)
     query = LaneQuery(graph)
-    owner = np.repeat(np.arange(graph.lanes), np.diff(graph.offset))
+    owner = np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))
     mine = (graph.kind[owner] == LaneType.DRIVING) & (graph.junction[owner] < 0)
     lane, s, lateral, inside = query.nearest(graph.xy[mine])
     assert inside.all()

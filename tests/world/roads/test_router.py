@@ -50,7 +50,7 @@ def near_after(graph: LaneGraph, here: int, there: int) -> bool:
             int(n)
             for lane in edge
             for n in (*graph.successors(lane), graph.left[lane], graph.right[lane])
-            if n >= 0 and (n in graph.successors(lane) or graph.same_direction(lane, int(n)))
+            if n >= 0 and (n in graph.successors(lane) or graph.is_same_direction(lane, int(n)))
         } - seen
         seen |= edge
     return there in seen
@@ -75,7 +75,12 @@ def lane_distance(graph: LaneGraph, start: tuple[int, float], end: tuple[int, fl
     for _ in range(3):
         for lane, s in list(begin.items()):
             for other in (int(graph.left[lane]), int(graph.right[lane])):
-                if other >= 0 and graph.kind[other] == 1 and graph.same_direction(lane, other) and other not in begin:
+                if (
+                    other >= 0
+                    and graph.kind[other] == 1
+                    and graph.is_same_direction(lane, other)
+                    and other not in begin
+                ):
                     begin[other] = s / float(graph.length[lane]) * float(graph.length[other])
     best = min((end[1] - s for lane, s in begin.items() if lane == end[0] and end[1] >= s), default=math.inf)
     for lane, s in begin.items():
@@ -92,7 +97,7 @@ def lane_distance(graph: LaneGraph, start: tuple[int, float], end: tuple[int, fl
                 options += [
                     (n, least[lane])
                     for n in (int(graph.left[lane]), int(graph.right[lane]))
-                    if n >= 0 and graph.same_direction(lane, n)
+                    if n >= 0 and graph.is_same_direction(lane, n)
                 ]
             for other, cost in options:
                 if other in least and cost < least[other] - 1e-6:
@@ -120,7 +125,7 @@ def test_routes_between_random_places(name: str) -> None:
 def test_a_lane_change_is_smooth_and_takes_about_20_m(name: str) -> None:
     graph = built_in(name)
     long = (graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 90.0)
-    lane = int(next(i for i in np.flatnonzero(long) if graph.same_direction(int(i), int(graph.left[i]))))
+    lane = int(next(i for i in np.flatnonzero(long) if graph.is_same_direction(int(i), int(graph.left[i]))))
     other = int(graph.left[lane])
     route = route_along(graph, [pose(graph, lane, 5.0), pose(graph, other, 80.0)], spacing=0.5)
     check(graph, route, turn=0.05)

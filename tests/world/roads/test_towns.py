@@ -41,7 +41,7 @@ def reach(graph: LaneGraph, start: int, step: Callable[[int], list[int]]) -> set
 def beside(graph: LaneGraph, lane: int) -> list[int]:
     if graph.junction[lane] >= 0:
         return []
-    return [n for n in (int(graph.left[lane]), int(graph.right[lane])) if n >= 0 and graph.same_direction(lane, n)]
+    return [n for n in (int(graph.left[lane]), int(graph.right[lane])) if n >= 0 and graph.is_same_direction(lane, n)]
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -83,12 +83,12 @@ def test_turns_can_be_driven(name: str) -> None:
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_neighbours_agree(name: str) -> None:
     graph = built_in(name)
-    for i in range(graph.lanes):
+    for i in range(graph.lane_count):
         left, right = int(graph.left[i]), int(graph.right[i])
         for other, side in ((left, 1.0), (right, -1.0)):
             if other < 0:
                 continue
-            same = graph.same_direction(i, other)
+            same = graph.is_same_direction(i, other)
             back = graph.right[other] if (side > 0) == same else graph.left[other]
             assert back == i
             middle = float(graph.length[i]) / 2

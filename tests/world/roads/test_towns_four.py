@@ -119,7 +119,7 @@ def test_lanes_are_smooth(name: str) -> None:
 def test_streets_do_not_overlap(name: str) -> None:
     """Lanes of different streets keep apart outside junctions."""
     graph = town(name)
-    lane = np.repeat(np.arange(graph.lanes), np.diff(graph.offset))
+    lane = np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))
     street = (graph.junction[lane] < 0) & (graph.kind[lane] != LaneType.NONE)
     xy, road, half = graph.xy[street].astype(float), graph.road[lane[street]], 0.5 * graph.width[street]
     for k in range(0, len(xy), 500):

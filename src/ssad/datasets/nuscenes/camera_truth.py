@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.boxes import NEAR, camera_yaw, hulls, size_columns
+from ssad.core.boxes import NEAR, camera_yaw, image_rectangles, size_columns
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, NO_ATTRIBUTE
@@ -115,5 +115,5 @@ def _hulls(frame: SensorFrame, annotations: Annotations, rotation: F64) -> tuple
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
     assert frame.intrinsic is not None
     camera_corners = annotations.corners() @ rotation[:3, :3].T + rotation[:3, 3]
-    box = hulls(camera_corners, frame.intrinsic, (frame.width, frame.height))
+    box = image_rectangles(camera_corners, frame.intrinsic, (frame.width, frame.height))
     return box, np.asarray(((box[:, 2:] - box[:, :2]) > 1.0).all(1))

@@ -19,7 +19,7 @@ from typing import Any, Final, Protocol, TypeVar
 import msgspec
 
 from ssad.core.errors import FormatError, StoreError
-from ssad.core.safeio import atomic_path, home
+from ssad.core.safeio import atomic_path, home_folder
 from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 from ssad.datasets.nuscenes.tables import stream, table_path
@@ -82,7 +82,7 @@ def open_index(root: Path, version: str, *, memory_limit_bytes: int | None = Non
     ):
         return MemoryIndex(root, version)
     folder_digest = digest(str((root / version).resolve()))[:16]
-    folder = home() / "cache" / "nuscenes"
+    folder = home_folder() / "cache" / "nuscenes"
     path = folder / f"{folder_digest}{digest(LAYOUT, table_state)[:16]}.sqlite"
     if not path.exists():
         build(path, root, version)
@@ -113,7 +113,7 @@ def build(path: Path, root: Path, version: str) -> None:
         with atomic_path(path) as temporary:
             connection = sqlite3.connect(temporary, isolation_level=None)
             try:
-                _fill(connection, root, version)
+                _fill_index(connection, root, version)
             finally:
                 connection.close()
     except StoreError as error:
@@ -122,27 +122,27 @@ def build(path: Path, root: Path, version: str) -> None:
         raise StoreError(f"{path}: the index cannot be written: {error}; {advice}") from None
 
 
-def _fill(connection: sqlite3.Connection, root: Path, version: str) -> None:
+def _fill_index(connection: sqlite3.Connection, root: Path, version: str) -> None:
     # No journal: the file is temporary until complete, so an interrupted one is simply discarded.
     for setting in ("journal_mode=OFF", "synchronous=OFF", "locking_mode=EXCLUSIVE", "page_size=8192"):
         connection.execute(f"PRAGMA {setting}")
     connection.execute("BEGIN")
     for name in TABLES:
         connection.execute(f"CREATE TABLE {name} (token, parent, body BLOB)")
-        connection.executemany(f"INSERT INTO {name} VALUES (?, ?, ?)", _packed(root, version, name))
+        connection.executemany(f"INSERT INTO {name} VALUES (?, ?, ?)", _packed_rows(root, version, name))
         try:
             connection.execute(f"CREATE UNIQUE INDEX {name}_token ON {name} (token)")
         except sqlite3.IntegrityError:
             query = f"SELECT token FROM {name} GROUP BY token HAVING count(*) > 1 LIMIT 1"
             key = connection.execute(query).fetchone()[0]
-            raise _twice(table_path(root, version, name), _unpack_key(key)) from None
+            raise _duplicate_token_error(table_path(root, version, name), _unpack_key(key)) from None
         if name in PARENT:
             connection.execute(f"CREATE INDEX {name}_parent ON {name} (parent)")
     connection.execute(f"PRAGMA user_version={LAYOUT}")
     connection.execute("COMMIT")
 
 
-def _packed(root: Path, version: str, name: str) -> Iterator[tuple[bytes | str, bytes | str | None, bytes]]:
+def _packed_rows(root: Path, version: str, name: str) -> Iterator[tuple[bytes | str, bytes | str | None, bytes]]:
     encode = msgspec.msgpack.Encoder().encode
     parent_field = PARENT.get(name)
     for block in stream(table_path(root, version, name), TABLES[name]):
@@ -163,7 +163,7 @@ def _unpack_key(key: bytes | str) -> str:
     return key.hex() if isinstance(key, bytes) else key
 
 
-def _twice(path: Path, token: str) -> FormatError:
+def _duplicate_token_error(path: Path, token: str) -> FormatError:
     return FormatError(f"{path}: two records have the token '{token}'")
 
 
@@ -188,7 +188,7 @@ class MemoryIndex:
             for block in stream(path, kind):
                 for record in block:
                     if table.setdefault(record.token, record) is not record:
-                        raise _twice(path, record.token)
+                        raise _duplicate_token_error(path, record.token)
                     if parent_field is not None:
                         rows_by_parent.setdefault(getattr(record, parent_field), []).append(record)
             self._rows[name] = table
@@ -224,16 +224,16 @@ class FileIndex:
 
     def rows(self, kind: type[R]) -> list[R]:
         """Return all rows of a table. StoreError if the file cannot be read."""
-        return [self._row(kind, body) for (body,) in self._ask(f"SELECT body FROM {_NAME[kind]} ORDER BY rowid", ())]
+        return [self._row(kind, body) for (body,) in self._query(f"SELECT body FROM {_NAME[kind]} ORDER BY rowid", ())]
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
         """Return rows by token; absent tokens are left out. StoreError if the file cannot be read."""
-        rows = self._in(kind, "token", list(dict.fromkeys(tokens)))
+        rows = self._rows_where(kind, "token", list(dict.fromkeys(tokens)))
         return {row.token: row for row in rows}
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
         """Rows whose parent (`PARENT`) is one of the given tokens. Raises StoreError when the file cannot be read."""
-        return self._in(kind, "parent", list(dict.fromkeys(parents)))
+        return self._rows_where(kind, "parent", list(dict.fromkeys(parents)))
 
     def close(self) -> None:
         """Close this thread's connection; the next query opens a new one."""
@@ -245,12 +245,12 @@ class FileIndex:
     def __del__(self) -> None:
         self.close()
 
-    def _in(self, kind: type[R], column: str, tokens: list[str]) -> list[R]:
+    def _rows_where(self, kind: type[R], column: str, tokens: list[str]) -> list[R]:
         rows: list[tuple[int, bytes]] = []
         for start in range(0, len(tokens), _BATCH):
             keys = [_key(token) for token in tokens[start : start + _BATCH]]
             placeholders = ",".join("?" * len(keys))
-            rows += self._ask(f"SELECT rowid, body FROM {_NAME[kind]} WHERE {column} IN ({placeholders})", keys)
+            rows += self._query(f"SELECT rowid, body FROM {_NAME[kind]} WHERE {column} IN ({placeholders})", keys)
         # By row id, which is the table order.
         rows.sort()
         return [self._row(kind, body) for _, body in rows]
@@ -258,7 +258,7 @@ class FileIndex:
     def _row(self, kind: type[R], body: bytes) -> R:
         return kind(*_decoder(kind).decode(body))
 
-    def _ask(self, query: str, values: Sequence[bytes | str]) -> list[Any]:
+    def _query(self, query: str, values: Sequence[bytes | str]) -> list[Any]:
         try:
             return self._connection().execute(query, values).fetchall()
         except sqlite3.Error as error:

@@ -23,7 +23,7 @@ from ssad.datasets.nuscenes.scene import (
     Annotations,
     SceneData,
     SensorFrame,
-    frozen,
+    make_read_only,
     velocities,
 )
 from ssad.datasets.nuscenes.schema import (
@@ -61,7 +61,7 @@ class NuScenes:
 
     def __init__(self, root: Path, version: str | None = None) -> None:
         self.root = Path(root)
-        self.version = _choose(self.root, version)
+        self.version = _choose_version(self.root, version)
         self._index: Index = open_index(self.root, self.version)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -122,16 +122,16 @@ class NuScenes:
             self.root, self.version, next(name for name, record_type in TABLES.items() if record_type is kind)
         )
 
-    def _need(self, kind: type[R], tokens: Iterable[str], source: type[TableRecord]) -> dict[str, R]:
+    def _require_rows(self, kind: type[R], tokens: Iterable[str], source: type[TableRecord]) -> dict[str, R]:
         """Return rows by token, all of them. FormatError names the table that refers to a missing row."""
         unique_tokens = list(dict.fromkeys(tokens))
         rows = self._index.get(kind, unique_tokens)
         for token in unique_tokens:
             if token not in rows:
-                raise self._dangling(source, kind, token)
+                raise self._dangling_token_error(source, kind, token)
         return rows
 
-    def _dangling(self, source: type[TableRecord], kind: type[TableRecord], token: str) -> FormatError:
+    def _dangling_token_error(self, source: type[TableRecord], kind: type[TableRecord], token: str) -> FormatError:
         table = self._path(kind).name
         return FormatError(f"{self._path(source)}: it names token '{token}', which {table} does not have")
 
@@ -162,8 +162,8 @@ class NuScenes:
         rows = self._index.children(SampleData, samples)
         if not rows:
             return ()
-        calibrations = self._need(CalibratedSensor, (row.calibrated_sensor_token for row in rows), SampleData)
-        poses = self._need(EgoPose, (row.ego_pose_token for row in rows), SampleData)
+        calibrations = self._require_rows(CalibratedSensor, (row.calibrated_sensor_token for row in rows), SampleData)
+        poses = self._require_rows(EgoPose, (row.ego_pose_token for row in rows), SampleData)
         sensor_poses = self._matrices(list(calibrations.values()))
         ego_poses = self._matrices(list(poses.values()))
         intrinsics = {token: self._intrinsic(record) for token, record in calibrations.items()}
@@ -202,7 +202,7 @@ class NuScenes:
     def _sensor(self, calibration: CalibratedSensor) -> Sensor:
         sensor = self._sensors.get(calibration.sensor_token)
         if sensor is None:
-            raise self._dangling(CalibratedSensor, Sensor, calibration.sensor_token)
+            raise self._dangling_token_error(CalibratedSensor, Sensor, calibration.sensor_token)
         return sensor
 
     def _intrinsic(self, calibration: CalibratedSensor) -> F64 | None:
@@ -211,7 +211,7 @@ class NuScenes:
         rows = calibration.camera_intrinsic
         if len(rows) != 3 or any(len(row) != 3 for row in rows):
             raise FormatError(f"{self._path(CalibratedSensor)}: '{calibration.token}': camera_intrinsic is not 3 x 3")
-        return frozen(np.array(rows, np.float64))
+        return make_read_only(np.array(rows, np.float64))
 
     def _matrices(self, records: Sequence[CalibratedSensor] | Sequence[EgoPose]) -> dict[str, F64]:
         """Return poses [4, 4] by token."""
@@ -220,13 +220,13 @@ class NuScenes:
         if len(zero_rows):
             record = records[int(zero_rows[0])]
             raise FormatError(f"{self._path(type(record))}: '{record.token}': the rotation has length zero")
-        matrices = frozen(pose_matrix([record.translation for record in records], quaternions))
+        matrices = make_read_only(pose_matrix([record.translation for record in records], quaternions))
         return {record.token: matrix for record, matrix in zip(records, matrices, strict=True)}
 
     def _boxes(self, samples: Sequence[Sample]) -> dict[str, Annotations]:
         """Return the boxes of each sample of a scene."""
         rows = self._index.children(SampleAnnotation, [sample.token for sample in samples])
-        instances = self._need(Instance, (row.instance_token for row in rows), SampleAnnotation)
+        instances = self._require_rows(Instance, (row.instance_token for row in rows), SampleAnnotation)
         row_by_token = {row.token: row_index for row_index, row in enumerate(rows)}
         sample_times = {sample.token: sample.timestamp for sample in samples}
         timestamps = np.array([sample_times[row.sample_token] for row in rows], np.int64)
@@ -247,12 +247,12 @@ class NuScenes:
                     tuple(self._attribute(name) for name in row.attribute_tokens) for row in annotations_of_sample
                 ),
                 visibility=tuple(row.visibility_token for row in annotations_of_sample),
-                centre=frozen(centre[sample_rows]),
-                size_lwh=frozen(
+                centre=make_read_only(centre[sample_rows]),
+                size_lwh=make_read_only(
                     _columns([row.size for row in annotations_of_sample], 3)[:, size_columns("wlh", "lwh")]
                 ),
                 rotation=self._rotations(annotations_of_sample),
-                velocity=frozen(velocity[sample_rows]),
+                velocity=make_read_only(velocity[sample_rows]),
                 lidar_points=_counts([row.num_lidar_pts for row in annotations_of_sample]),
                 radar_points=_counts([row.num_radar_pts for row in annotations_of_sample]),
             )
@@ -267,7 +267,7 @@ class NuScenes:
                     continue
                 neighbour = row_by_token.get(token)
                 if neighbour is None:
-                    raise self._dangling(SampleAnnotation, SampleAnnotation, token)
+                    raise self._dangling_token_error(SampleAnnotation, SampleAnnotation, token)
                 if (time[neighbour] >= time[row_index]) if side == 0 else (time[neighbour] <= time[row_index]):
                     field_name = "prev" if side == 0 else "next"
                     expected_order = "earlier" if side == 0 else "later"
@@ -281,13 +281,13 @@ class NuScenes:
     def _category(self, instance: Instance) -> str:
         name = self._categories.get(instance.category_token)
         if name is None:
-            raise self._dangling(Instance, Category, instance.category_token)
+            raise self._dangling_token_error(Instance, Category, instance.category_token)
         return name
 
     def _attribute(self, token: str) -> str:
         name = self._attributes.get(token)
         if name is None:
-            raise self._dangling(SampleAnnotation, Attribute, token)
+            raise self._dangling_token_error(SampleAnnotation, Attribute, token)
         return name
 
     def _rotations(self, rows: Sequence[SampleAnnotation]) -> F64:
@@ -299,7 +299,7 @@ class NuScenes:
         return rotation
 
 
-def _choose(root: Path, version: str | None) -> str:
+def _choose_version(root: Path, version: str | None) -> str:
     """Return the version to open: the requested one, else the only one. ConfigError if there is none."""
     if not root.is_dir():
         raise ConfigError(f"{root}: no such folder; give the nuScenes folder that holds v1.0-*, samples and sweeps")
@@ -316,7 +316,7 @@ def _choose(root: Path, version: str | None) -> str:
 
 
 def _columns(rows: Sequence[tuple[float, ...]], width: int) -> F64:
-    return frozen(np.array(rows, np.float64).reshape(len(rows), width))
+    return make_read_only(np.array(rows, np.float64).reshape(len(rows), width))
 
 
 def _counts(values: Sequence[int]) -> I32:

@@ -112,12 +112,12 @@ def read_results(
     unexpected = next((token for token in sample_boxes if token not in sample_index), None)
     if unexpected is not None:
         raise FormatError(f"{path}: sample {unexpected} is not in the split; leave it out or choose its split")
-    with uncollected():
+    with pause_garbage_collection():
         boxes, points = _columns(path, sample_boxes, sample_index, max_boxes=max_boxes)
     return DetectionResults(sample_tokens, boxes, points, meta)
 
 
-def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
+def add_ego_distance(boxes: BoxTable, ego: F64) -> BoxTable:
     """Return the boxes with their distance from the ego in the plane.
 
     Args:
@@ -143,7 +143,7 @@ def _columns(
         try:
             boxes = decoder.decode(encoded)
         except msgspec.MsgspecError as error:
-            raise FormatError(f"{path}: sample {token}: {_place(error)}") from None
+            raise FormatError(f"{path}: sample {token}: {_describe_path(error)}") from None
         counts[sample_number] = len(boxes)
         if len(boxes) > max_boxes:
             raise FormatError(f"{path}: sample {token}: {len(boxes)} boxes, but at most {max_boxes} are allowed")
@@ -154,7 +154,7 @@ def _columns(
             labels.append(np.array([_LABEL[box.detection_name] for box in boxes], np.int8))
             attributes.append(np.array([_ATTRIBUTE[box.attribute_name] for box in boxes], np.int8))
         except KeyError:
-            raise _unknown(path, token, boxes) from None
+            raise _unknown_sample_error(path, token, boxes) from None
         if any(box.sample_token != token for box in boxes):
             box_number = next(sample_number for sample_number, box in enumerate(boxes) if box.sample_token != token)
             raise FormatError(
@@ -197,7 +197,7 @@ def _numbers(boxes: Sequence[_Box]) -> F64:
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def pause_garbage_collection() -> Iterator[None]:
     """Pause garbage collection: many small objects without cycles would trigger it again and again."""
     enabled = gc.isenabled()
     gc.disable()
@@ -228,14 +228,14 @@ def _read(path: str | Path) -> bytes | bytearray:
                 return text
             del text  # a file can be large: hold its text only once
             stream.seek(0)
-            return _without_nan(stream)
+            return _replace_nan(stream)
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def _without_nan(file: BinaryIO) -> bytearray:
+def _replace_nan(file: BinaryIO) -> bytearray:
     """The text block by block; a NaN is inside of a string where an odd number of quotation marks goes before."""
     output = bytearray()
     counted_bytes, quotes = 0, 0  # quotation marks among the first `counted` bytes of out
@@ -248,19 +248,19 @@ def _without_nan(file: BinaryIO) -> bytearray:
         head, *tails = block.split(b"NaN")
         output += head
         for tail in tails:
-            quotes += _quotes(output[counted_bytes:])
+            quotes += _count_quotes(output[counted_bytes:])
             counted_bytes = len(output)
             output += (b"null" if quotes % 2 == 0 else b"NaN") + tail
         if not chunk:
             return output
 
 
-def _quotes(text: bytearray) -> int:
+def _count_quotes(text: bytearray) -> int:
     """Return the number of quotation marks that begin or end a string."""
     return (re.sub(rb"\\.", b"", text, flags=re.DOTALL) if b"\\" in text else text).count(b'"')
 
 
-def _place(error: msgspec.MsgspecError) -> str:
+def _describe_path(error: msgspec.MsgspecError) -> str:
     """Return the message of a msgspec error with its path `$[3].size` in words."""
     message = str(error)
     location = re.search(r" - at `\$(?:\[(\d+|\.\.\.)\])?\.?(.*?)`$", message)
@@ -270,7 +270,7 @@ def _place(error: msgspec.MsgspecError) -> str:
     return prefix + message[: location.start()]
 
 
-def _unknown(path: str | Path, token: str, boxes: Sequence[_Box]) -> FormatError:
+def _unknown_sample_error(path: str | Path, token: str, boxes: Sequence[_Box]) -> FormatError:
     for number, box in enumerate(boxes):
         if box.detection_name not in _LABEL:
             problem = f"unknown detection_name '{box.detection_name}'; known: {', '.join(CLASSES)}"

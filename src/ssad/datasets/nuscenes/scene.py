@@ -103,7 +103,7 @@ class SceneData:
         next_index = bisect_left(times, timestamp_us)
         if next_index == len(times) or timestamp_us == times[next_index]:
             return self.boxes[self.samples[min(next_index, len(times) - 1)].token]
-        return self._between(next_index, timestamp_us)
+        return self._interpolate(next_index, timestamp_us)
 
     def annotations_of(self, frame: SensorFrame) -> Annotations:
         """Return the boxes of a frame as the official get_boxes does: those of its sample, moved for sweeps."""
@@ -111,10 +111,10 @@ class SceneData:
             return self.annotations(frame.sample_token)
         for sample_index, sample in enumerate(self.samples):
             if sample.token == frame.sample_token:
-                return self._between(sample_index, frame.timestamp_us)
+                return self._interpolate(sample_index, frame.timestamp_us)
         return self.annotations(frame.sample_token)
 
-    def _between(self, sample_number: int, timestamp_us: int) -> Annotations:
+    def _interpolate(self, sample_number: int, timestamp_us: int) -> Annotations:
         """Boxes of sample `sample_number`, moved towards the sample before it; times beyond the two are clipped."""
         sample = self.samples[sample_number]
         current = self.boxes[sample.token]
@@ -139,7 +139,7 @@ class SceneData:
             current.centre[current_index] - previous.centre[previous_index]
         )
         rotation[current_index] = slerp(previous.rotation[previous_index], current.rotation[current_index], fraction)
-        return replace(current, centre=frozen(centre), rotation=frozen(rotation))
+        return replace(current, centre=make_read_only(centre), rotation=make_read_only(rotation))
 
 
 def velocities(centre: F64, time: npt.NDArray[np.int64], previous_rows: I32, next_rows: I32) -> F64:
@@ -164,7 +164,7 @@ def velocities(centre: F64, time: npt.NDArray[np.int64], previous_rows: I32, nex
         return np.where(is_valid[:, None], (centre[end_rows] - centre[start_rows]) / seconds[:, None], np.nan)
 
 
-def frozen(array: F64) -> F64:
+def make_read_only(array: F64) -> F64:
     """Make an array read-only and return it."""
     array.setflags(write=False)
     return array

@@ -18,7 +18,7 @@ from rich.table import Table
 from ssad.core.errors import FormatError
 from ssad.core.safeio import write_atomic
 from ssad.core.seeding import generator
-from ssad.datasets.nuscenes.results import read_results, with_ego
+from ssad.datasets.nuscenes.results import add_ego_distance, read_results
 from ssad.datasets.nuscenes.splits import official_splits, scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.metrics.detection import CVPR_2019, DetectionConfig, check_counts, filter_boxes, match, scene_intervals
@@ -67,7 +67,7 @@ def score_results(
     )
     check_fields = check(predictions.meta, truth) if check is not None else {}
     results_time = time.perf_counter()
-    boxes = with_ego(predictions.boxes, truth.ego)
+    boxes = add_ego_distance(predictions.boxes, truth.ego)
     try:
         check_counts(boxes, config=config, names=truth.samples)
         matches = match(

@@ -46,7 +46,7 @@ def stream(path: Path, kind: type[T], *, block: int = BLOCK) -> Iterator[list[T]
                 line_number += text.count(b"\n", 0, list_start)
                 text, opened = text[list_start:], True
             if not chunk:
-                yield _last(path, decoder, text, line_number)
+                yield _decode_rest(path, decoder, text, line_number)
                 return
             # A closing brace may end a record: decoding decides.
             block_end = text.rfind(b"}") + 1
@@ -67,7 +67,7 @@ def stream(path: Path, kind: type[T], *, block: int = BLOCK) -> Iterator[list[T]
             yield records
 
 
-def _last(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> list[T]:
+def _decode_rest(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> list[T]:
     """Decode the records between the last cut and the end of the list."""
     elements = text.lstrip(_SPACE)
     if elements[:1] == b",":

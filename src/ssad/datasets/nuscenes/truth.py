@@ -19,7 +19,7 @@ from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, BICYCLE_RACK, CATEGORY_TO_CLASS, CLASSES, LIDAR, VISIBILITY
 from ssad.core.types import F64, I32
-from ssad.datasets.nuscenes.results import uncollected, with_ego
+from ssad.datasets.nuscenes.results import add_ego_distance, pause_garbage_collection
 from ssad.datasets.nuscenes.scene import velocities
 from ssad.datasets.nuscenes.schema import (
     Attribute,
@@ -64,29 +64,29 @@ class GroundTruth:
 
 
 # only the needed fields of a table: the decoder skips all others
-class _Calibrated(msgspec.Struct, gc=False):
+class _CalibratedSensorRow(msgspec.Struct, gc=False):
     token: str
     sensor_token: str
 
 
-class _Instance(msgspec.Struct, gc=False):
+class _InstanceRow(msgspec.Struct, gc=False):
     token: str
     category_token: str
 
 
-class _Data(msgspec.Struct, gc=False):
+class _SampleDataRow(msgspec.Struct, gc=False):
     sample_token: str
     ego_pose_token: str
     calibrated_sensor_token: str
     is_key_frame: bool
 
 
-class _Pose(msgspec.Struct, gc=False):
+class _EgoPoseRow(msgspec.Struct, gc=False):
     token: str
     translation: Vector
 
 
-class _Annotation(msgspec.Struct, gc=False):
+class _AnnotationRow(msgspec.Struct, gc=False):
     token: str
     sample_token: str
     instance_token: str
@@ -136,10 +136,10 @@ def read_truth(
     scene_index = {scene_name: position for position, scene_name in enumerate(scene_names)}
     scene_of_sample = np.array([scene_index[name_by_token[sample.scene_token]] for sample in selected], np.int32)
     ego = _ego(tables, sample_index)
-    with uncollected():
+    with pause_garbage_collection():
         boxes, points, visibility, racks = _annotations(tables, selected, sample_index)
     return GroundTruth(
-        tuple(sample_index), scene_of_sample, scene_names, ego, with_ego(boxes, ego), points, visibility, racks
+        tuple(sample_index), scene_of_sample, scene_names, ego, add_ego_distance(boxes, ego), points, visibility, racks
     )
 
 
@@ -170,11 +170,11 @@ def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
     sensors = {sensor.token for sensor in tables.rows("sensor", Sensor) if sensor.channel == LIDAR}
     lidar_calibrations = {
         calibration.token
-        for calibration in tables.rows("calibrated_sensor", _Calibrated)
+        for calibration in tables.rows("calibrated_sensor", _CalibratedSensorRow)
         if calibration.sensor_token in sensors
     }
     pose_tokens: list[str | None] = [None] * len(index)
-    for record in tables.rows("sample_data", _Data):
+    for record in tables.rows("sample_data", _SampleDataRow):
         if (
             record.is_key_frame
             and record.calibrated_sensor_token in lidar_calibrations
@@ -187,7 +187,7 @@ def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
     used_poses = set(pose_tokens)
     positions = {
         ego_pose.token: ego_pose.translation
-        for ego_pose in tables.rows("ego_pose", _Pose)
+        for ego_pose in tables.rows("ego_pose", _EgoPoseRow)
         if ego_pose.token in used_poses
     }
     missing = next((token for token in pose_tokens if token not in positions), None)
@@ -208,7 +208,7 @@ def _annotations(
     } | {BICYCLE_RACK: _RACK_LABEL}
     label_by_instance = {
         instance.token: label_by_category.get(tables.find(category_names, instance.category_token, "category"), -1)
-        for instance in tables.rows("instance", _Instance)
+        for instance in tables.rows("instance", _InstanceRow)
     }
     attributes = {
         annotation.token: ATTRIBUTES.index(annotation.name)
@@ -227,7 +227,7 @@ def _annotations(
     tokens: list[str] = []
     previous_tokens: list[str] = []
     next_tokens: list[str] = []
-    for block in stream(path, _Annotation):
+    for block in stream(path, _AnnotationRow):
         relevant = [
             annotation
             for annotation in block
@@ -286,7 +286,7 @@ def _annotations(
     return boxes, columns[box_rows, 4].astype(np.int32), columns[box_rows, 3].astype(np.int8), racks
 
 
-def _label(path: Path, annotation: _Annotation, label_of: Mapping[str, int]) -> int:
+def _label(path: Path, annotation: _AnnotationRow, label_of: Mapping[str, int]) -> int:
     """Class of an annotation, -1 for one that does not count."""
     label = label_of.get(annotation.instance_token)
     if label is None:
@@ -296,7 +296,7 @@ def _label(path: Path, annotation: _Annotation, label_of: Mapping[str, int]) -> 
     return label
 
 
-def _attribute(path: Path, annotation: _Annotation, attribute_index: Mapping[str, int]) -> int:
+def _attribute(path: Path, annotation: _AnnotationRow, attribute_index: Mapping[str, int]) -> int:
     """Index of an annotation's attribute, -1 for none."""
     if not annotation.attribute_tokens:
         return -1

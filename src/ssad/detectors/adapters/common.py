@@ -13,7 +13,7 @@ from torchvision.ops import batched_nms
 
 from ssad.core.detections import Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.eval_mode import evaluating
+from ssad.core.eval_mode import in_eval_mode
 from ssad.detectors.yolo.assign import Targets, pad_truth
 
 
@@ -51,7 +51,7 @@ class Adapter(nn.Module, ABC):
     ) -> list[Detections]:
         """Return the detections of each image, best first, selected as in the source."""
         min_score = check_threshold(self.name, self.threshold if threshold is None else threshold)
-        with evaluating(self):
+        with in_eval_mode(self):
             dense = self.dense(images)
         return self.choose(dense, min_score)
 
@@ -60,7 +60,7 @@ class Adapter(nn.Module, ABC):
         """Return the detections of each image above a score."""
 
 
-def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
+def labels_and_owners(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
     """Return labels and owners of places from the result of a matcher.
 
     Args:
@@ -97,24 +97,24 @@ def check_images(name: str, images: Tensor, *, min_count: int = 1) -> tuple[int,
     return images.shape[2], images.shape[3]
 
 
-def size_inside(size: tuple[int, int], input_width: int | None) -> tuple[int, int]:
+def resized_size(size: tuple[int, int], input_width: int | None) -> tuple[int, int]:
     """Return height and width to which an image of `size` is resized before padding (None: unchanged)."""
     if input_width is None:
         return size
     return max(1, round(size[0] * input_width / size[1])), input_width
 
 
-def scale_of(inside: tuple[int, int], size: tuple[int, int], template: Tensor) -> Tensor:
+def input_scale(input_size: tuple[int, int], size: tuple[int, int], template: Tensor) -> Tensor:
     """Return the factors [4] from boxes in an image of `size` to boxes in the network's input of size `inside`."""
-    x, y = inside[1] / size[1], inside[0] / size[0]
+    x, y = input_size[1] / size[1], input_size[0] / size[0]
     return torch.tensor([x, y, x, y], device=template.device, dtype=template.dtype)
 
 
-def resize_and_pad(images: Tensor, inside: tuple[int, int], *, multiple: int, grey: float) -> Tensor:
-    """Resize images [B, 3, H, W] to `inside` and pad right and bottom to a multiple of `multiple` pixels."""
-    if inside != tuple(images.shape[2:]):
-        images = functional.interpolate(images, inside, mode="bilinear", align_corners=False)
-    return functional.pad(images, (0, -inside[1] % multiple, 0, -inside[0] % multiple), value=grey)
+def resize_and_pad(images: Tensor, input_size: tuple[int, int], *, multiple: int, grey: float) -> Tensor:
+    """Resize images [B, 3, H, W] to `input_size` and pad right and bottom to a multiple of `multiple` pixels."""
+    if input_size != tuple(images.shape[2:]):
+        images = functional.interpolate(images, input_size, mode="bilinear", align_corners=False)
+    return functional.pad(images, (0, -input_size[1] % multiple, 0, -input_size[0] % multiple), value=grey)
 
 
 def check_threshold(name: str, threshold: float) -> float:

@@ -21,8 +21,8 @@ from ssad.detectors.adapters.common import (
     Adapter,
     check_images,
     check_truth,
+    input_scale,
     log_odds,
-    scale_of,
     sum_by_image,
     suppress,
 )
@@ -82,9 +82,9 @@ class OneStage(Adapter):
         # The model's own transform normalises and resizes, so weights see the input they were trained with.
         batch, _ = self.model.transform(list(images.to(next(self.model.parameters()).dtype)))
         features = list(self.model.backbone(batch.tensors).values())
-        heads = {name: full(value) for name, value in self.model.head(features).items()}
-        anchors = full(self.model.anchor_generator(batch, features)[0])
-        scale = scale_of(batch.image_sizes[0], size, anchors)
+        heads = {name: to_full_precision(value) for name, value in self.model.head(features).items()}
+        anchors = to_full_precision(self.model.anchor_generator(batch, features)[0])
+        scale = input_scale(batch.image_sizes[0], size, anchors)
         level, stride = self._levels(features, batch.tensors.shape[2], anchors.device)
         logit = log_odds(heads["cls_logits"]) if self.kind == "ssd" else heads["cls_logits"]
         return Dense(
@@ -262,7 +262,7 @@ class OneStage(Adapter):
         return level, stride[level]
 
 
-def full(value: Tensor) -> Tensor:
+def to_full_precision(value: Tensor) -> Tensor:
     """Return the value in float32 or finer; half precision is too coarse for boxes and losses."""
     return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
 

@@ -14,7 +14,7 @@ from torchvision import models
 from torchvision.models import detection
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
-from ssad.core.checkpoints import COUNTER, fit_state, load_weights
+from ssad.core.checkpoints import COUNTER, copy_state, load_weights
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.detectors.adapters.torchvision import OneStage
 from ssad.detectors.adapters.two_stage import TwoStage
@@ -117,7 +117,7 @@ def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], origin
                 submodule.eps = 0.0
     if not any(key.startswith("model.") for key in state):
         state = {f"model.{key}": value for key, value in state.items()}
-    fit_state(detector, state, origin)
+    copy_state(detector, state, origin)
 
 
 def wrap(

@@ -24,8 +24,16 @@ from torchvision.ops import box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, label_owned, log_odds, scale_of, suppress
-from ssad.detectors.adapters.torchvision import full
+from ssad.detectors.adapters.common import (
+    Adapter,
+    check_images,
+    check_truth,
+    input_scale,
+    labels_and_owners,
+    log_odds,
+    suppress,
+)
+from ssad.detectors.adapters.torchvision import to_full_precision
 from ssad.detectors.yolo.assign import Targets
 
 EMPTY_LOGIT = -30.0  # logit of a place without proposal; its sigmoid is 0 but for 1e-13
@@ -77,8 +85,8 @@ class TwoStage(Adapter):
             for name in image_maps[0]
             if name not in ("anchors", "inside")
         }
-        anchors, inside = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
-        scale = scale_of((inside[0], inside[1]), size, anchors)
+        anchors, network_size = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
+        scale = input_scale((network_size[0], network_size[1]), size, anchors)
         filled = maps["filled"]
         logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], EMPTY_LOGIT)
         column = self.columns[logit.argmax(-1)]
@@ -107,10 +115,10 @@ class TwoStage(Adapter):
         features = self.model.backbone(batch.tensors)
         levels = list(features.values())
         scores, regressions = rpn.head(levels)
-        anchors = full(rpn.anchor_generator(batch, levels)[0])
+        anchors = to_full_precision(rpn.anchor_generator(batch, levels)[0])
         counts = [level_scores.shape[1] * level_scores.shape[2] * level_scores.shape[3] for level_scores in scores]
         objectness, regression = concat_box_prediction_layers(scores, regressions)
-        objectness, regression = full(objectness), full(regression)
+        objectness, regression = to_full_precision(objectness), to_full_precision(regression)
         with torch.no_grad():
             proposals = rpn.box_coder.decode(regression.detach(), [anchors]).view(1, -1, 4)
             selected, _ = rpn.filter_proposals(proposals, objectness.detach()[None], batch.image_sizes, counts)
@@ -123,7 +131,7 @@ class TwoStage(Adapter):
         empty_count = rpn.post_nms_top_n() - len(selected[0])
 
         def fill(value: Tensor) -> Tensor:
-            return functional.pad(full(value), (0, 0, 0, empty_count))[None]
+            return functional.pad(to_full_precision(value), (0, 0, 0, empty_count))[None]
 
         filled = torch.arange(len(selected[0]) + empty_count, device=image.device) < len(selected[0])
         outputs = {
@@ -185,7 +193,7 @@ class TwoStage(Adapter):
                 rows.append((background, torch.zeros_like(anchors)))
                 continue
             anchor_owner = self.model.rpn.proposal_matcher(box_iou(targets.box[image_index, :object_count], anchors))
-            anchor_label, _ = label_owned(
+            anchor_label, _ = labels_and_owners(
                 anchor_owner, torch.ones_like(targets.label[image_index]), targets.crowd[image_index]
             )
             rows.append(
@@ -220,7 +228,7 @@ class TwoStage(Adapter):
             owner[best_proposal[largest_overlap > 0]] = torch.arange(object_count, device=owner.device)[
                 largest_overlap > 0
             ]
-            label, owner = label_owned(
+            label, owner = labels_and_owners(
                 owner.masked_fill(~filled, -2), object_labels[image_index], targets.crowd[image_index]
             )
             rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))

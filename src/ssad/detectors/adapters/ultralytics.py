@@ -28,16 +28,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.core.checkpoints import fit_state, load_weights
+from ssad.core.checkpoints import copy_state, load_weights
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError, install_extra
 from ssad.detectors.adapters.common import (
     Adapter,
     check_images,
     check_truth,
-    label_owned,
+    labels_and_owners,
     resize_and_pad,
-    size_inside,
+    resized_size,
     sum_by_image,
 )
 from ssad.detectors.yolo.assign import Targets
@@ -88,7 +88,7 @@ def ultralytics_detector(
     if weights is not None:
         state = load_weights(weights)
         prefixed = {key if key.startswith("model.") else f"model.{key}": value for key, value in state.items()}
-        fit_state(detector, {f"network.{key}": value for key, value in prefixed.items()}, weights)
+        copy_state(detector, {f"network.{key}": value for key, value in prefixed.items()}, weights)
     return detector
 
 
@@ -164,10 +164,10 @@ class Ultralytics(Adapter):
                 and YOLO11's.
         """
         size = check_images(self.name, images)
-        inside, scale = size_inside(size, self.input_width), self._scale(size, images.device)
+        network_size, scale = resized_size(size, self.input_width), self._scale(size, images.device)
         images = images.to(next(self.network.parameters()).dtype)
         multiple = max(32, *self.strides)
-        scores, boxes, features = self._heads(resize_and_pad(images, inside, multiple=multiple, grey=GREY))
+        scores, boxes, features = self._heads(resize_and_pad(images, network_size, multiple=multiple, grey=GREY))
         place, stride, level = self._places(features)
         distance = _expectation(boxes) * stride
         centre = place.T
@@ -240,7 +240,7 @@ class Ultralytics(Adapter):
         # TOOD: the best place of an object gets its largest overlap as target score.
         normaliser = torch.where(is_owned, overlap, 0.0).amax(0) / (owned_alignment.amax(0) + 1e-9)
         weight = (owned_alignment * normaliser).amax(1)
-        label, owner = label_owned(owner, object_labels, crowd)
+        label, owner = labels_and_owners(owner, object_labels, crowd)
         is_object = label >= 0
         return label, owner, torch.where(is_object[:, None], box[index], 0.0), torch.where(is_object, weight, 0.0)
 
@@ -318,7 +318,7 @@ class Ultralytics(Adapter):
         return torch.cat(place), torch.cat(stride), torch.cat(level)
 
     def _scale(self, size: tuple[int, int], device: torch.device) -> Tensor:
-        height, width = size_inside(size, self.input_width)
+        height, width = resized_size(size, self.input_width)
         x, y = width / size[1], height / size[0]
         return torch.tensor([x, y, x, y], device=device)
 

@@ -19,12 +19,12 @@ class DeformConv(nn.Module):
     For each place, `conv_offset` predicts 9 vertical and 9 horizontal offsets (interleaved as y, x) and 9 masks.
     """
 
-    def __init__(self, inside: int, outside: int, *, stride: int = 1, bias: bool = False) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1, bias: bool = False) -> None:
         super().__init__()
         self.stride = stride
-        self.weight = nn.Parameter(torch.empty(outside, inside, 3, 3))
-        self.bias = nn.Parameter(torch.zeros(outside)) if bias else None
-        self.conv_offset = nn.Conv2d(inside, 27, 3, stride, 1)
+        self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        self.conv_offset = nn.Conv2d(in_channels, 27, 3, stride, 1)
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
         # Zero offsets and masks of 0.5 make it an ordinary convolution with half the weights.
         nn.init.zeros_(self.conv_offset.weight)
@@ -53,9 +53,9 @@ class DeformConv(nn.Module):
 class Bottleneck(nn.Module):
     """1 x 1 (with the stride), 3 x 3 (deformable or not), 1 x 1."""
 
-    def __init__(self, inside: int, width: int, *, stride: int, deformable: bool, fit: bool) -> None:
+    def __init__(self, in_channels: int, width: int, *, stride: int, deformable: bool, is_first_block: bool) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inside, width, 1, stride, bias=False)
+        self.conv1 = nn.Conv2d(in_channels, width, 1, stride, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.conv2: nn.Module = (
             DeformConv(width, width) if deformable else nn.Conv2d(width, width, 3, padding=1, bias=False)
@@ -64,9 +64,9 @@ class Bottleneck(nn.Module):
         self.conv3 = nn.Conv2d(width, 4 * width, 1, bias=False)
         self.bn3 = nn.BatchNorm2d(4 * width)
         self.downsample: nn.Module | None = None
-        if fit:
+        if is_first_block:
             self.downsample = nn.Sequential(
-                nn.Conv2d(inside, 4 * width, 1, stride, bias=False), nn.BatchNorm2d(4 * width)
+                nn.Conv2d(in_channels, 4 * width, 1, stride, bias=False), nn.BatchNorm2d(4 * width)
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -77,18 +77,18 @@ class Bottleneck(nn.Module):
         return functional.relu(self.bn3(self.conv3(x)) + shortcut)
 
 
-class Basic(nn.Module):
+class BasicBlock(nn.Module):
     """Two 3 x 3 convolutions."""
 
-    def __init__(self, inside: int, width: int, *, stride: int) -> None:
+    def __init__(self, in_channels: int, width: int, *, stride: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inside, width, 3, stride, 1, bias=False)
+        self.conv1 = nn.Conv2d(in_channels, width, 3, stride, 1, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
         self.bn2 = nn.BatchNorm2d(width)
         self.downsample: nn.Module | None = None
-        if stride > 1 or inside != width:
-            self.downsample = nn.Sequential(nn.Conv2d(inside, width, 1, stride, bias=False), nn.BatchNorm2d(width))
+        if stride > 1 or in_channels != width:
+            self.downsample = nn.Sequential(nn.Conv2d(in_channels, width, 1, stride, bias=False), nn.BatchNorm2d(width))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [B, width, H / stride, W / stride] from [B, C, H, W]."""
@@ -112,11 +112,17 @@ class Backbone(nn.Module):
                 stride = 2 if stage and not block_index else 1
                 if depth in BLOCKS:
                     blocks.append(
-                        Bottleneck(in_channels, stage_width, stride=stride, deformable=stage >= 2, fit=not block_index)
+                        Bottleneck(
+                            in_channels,
+                            stage_width,
+                            stride=stride,
+                            deformable=stage >= 2,
+                            is_first_block=not block_index,
+                        )
                     )
                     in_channels = 4 * stage_width
                 else:
-                    blocks.append(Basic(in_channels, stage_width, stride=stride))
+                    blocks.append(BasicBlock(in_channels, stage_width, stride=stride))
                     in_channels = stage_width
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
         expansion = 4 if depth in BLOCKS else 1
@@ -138,9 +144,9 @@ class Backbone(nn.Module):
 class Conv(nn.Module):
     """A convolution under the name `conv`, which the published weights of the neck use."""
 
-    def __init__(self, inside: int, outside: int, size: int, stride: int = 1) -> None:
+    def __init__(self, in_channels: int, out_channels: int, size: int, stride: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inside, outside, size, stride, size // 2)
+        self.conv = nn.Conv2d(in_channels, out_channels, size, stride, size // 2)
         nn.init.xavier_uniform_(self.conv.weight)
         nn.init.zeros_(self.conv.bias)  # type: ignore[arg-type]
 
@@ -153,9 +159,9 @@ class Conv(nn.Module):
 class Neck(nn.Module):
     """Feature pyramid (Lin et al. 2017) over three maps; further levels follow from the last output, with a ReLU."""
 
-    def __init__(self, inside: tuple[int, ...], channels: int, levels: int) -> None:
+    def __init__(self, in_channels: tuple[int, ...], channels: int, levels: int) -> None:
         super().__init__()
-        self.lateral_convs = nn.ModuleList(Conv(input_channels, channels, 1) for input_channels in inside)
+        self.lateral_convs = nn.ModuleList(Conv(input_channels, channels, 1) for input_channels in in_channels)
         self.fpn_convs = nn.ModuleList(Conv(channels, channels, 3, 1 if level < 3 else 2) for level in range(levels))
 
     def forward(self, maps: list[Tensor]) -> list[Tensor]:

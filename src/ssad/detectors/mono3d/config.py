@@ -132,7 +132,7 @@ class Mono3DConfig:
         if self.input_width is not None and self.input_width < 64:
             raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
 
-    def changed(self, options: Mapping[str, Any]) -> Mono3DConfig:
+    def with_changes(self, options: Mapping[str, Any]) -> Mono3DConfig:
         """Return a copy with other values; raise ConfigError for an unknown option."""
         option_names = {option.name for option in fields(self)}
         for name in options:
@@ -143,7 +143,7 @@ class Mono3DConfig:
         return replace(self, **options)
 
     @property
-    def groups(self) -> tuple[int, ...]:
+    def regression_channels(self) -> tuple[int, ...]:
         """Channels of each part of the regression: offset, depth, size, yaw, velocity (, 2D box)."""
         yaw = 1 if self.heading == "bins" else 4
         return (2, 1, 3, yaw, 2, 4) if self.pgd else (2, 1, 3, yaw, 2)

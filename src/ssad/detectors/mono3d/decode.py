@@ -56,15 +56,15 @@ def flatten(maps: dict[str, list[Tensor]]) -> FlatMaps:
     )
 
 
-def pick(flat: FlatMaps, image: Tensor, rows: Tensor) -> FlatMaps:
+def select_rows(flat_maps: FlatMaps, image: Tensor, rows: Tensor) -> FlatMaps:
     """Return the rows [N] of images [N]."""
-    bins = None if flat.bins is None else flat.bins[image, rows]
+    bins = None if flat_maps.bins is None else flat_maps.bins[image, rows]
     return FlatMaps(
-        flat.logit[image, rows],
-        flat.reg[image, rows],
-        flat.direction[image, rows],
-        flat.attribute[image, rows],
-        flat.centreness[image, rows],
+        flat_maps.logit[image, rows],
+        flat_maps.reg[image, rows],
+        flat_maps.direction[image, rows],
+        flat_maps.attribute[image, rows],
+        flat_maps.centreness[image, rows],
         bins,
     )
 

@@ -13,10 +13,10 @@ from torchvision.ops import batched_nms, box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.eval_mode import evaluating
+from ssad.core.eval_mode import in_eval_mode
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.tensor_boxes import solid_corners
-from ssad.detectors.adapters.common import check_images, check_threshold, scale_of, size_inside
+from ssad.detectors.adapters.common import check_images, check_threshold, input_scale, resized_size
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
@@ -24,9 +24,9 @@ from ssad.detectors.mono3d.decode import (
     flatten,
     global_yaw,
     hull,
-    pick,
     places_of,
     project,
+    select_rows,
     unproject,
     yaw_of_vectors,
 )
@@ -86,17 +86,17 @@ class Mono3D(nn.Module):
         """
         maps, features, network_intrinsic, size = self._maps(images, intrinsic)
         scale, rows_above = self._scale(size, network_intrinsic), self._rows_above(size)
-        flat = flatten(maps)
+        flat_maps = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
         with _full_precision(images):
             if self.training:
-                box = flat.reg.new_zeros((len(images), 0, 4))
+                box = flat_maps.reg.new_zeros((len(images), 0, 4))
             else:
-                solids = self._solids(flat, places.xy, network_intrinsic[:, None])
-                box = self._boxes(flat, places.xy, solids, intrinsic=network_intrinsic[:, None], size=size)
+                solids = self._solids(flat_maps, places.xy, network_intrinsic[:, None])
+                box = self._boxes(flat_maps, places.xy, solids, intrinsic=network_intrinsic[:, None], size=size)
         return Dense(
-            logit=flat.logit,
-            quality=flat.centreness,
+            logit=flat_maps.logit,
+            quality=flat_maps.centreness,
             box=box,
             place=(places.xy - places.xy.new_tensor([0.0, rows_above])) / scale,
             stride=places.stride / scale[0],
@@ -112,9 +112,9 @@ class Mono3D(nn.Module):
         """Return the head's maps, its input, the intrinsics [B, 3, 3] in the network's input, and the image size."""
         size, network_intrinsic = self._check(images, intrinsic)
         network_intrinsic = self._scale_intrinsic(network_intrinsic, size, self._scale(size, network_intrinsic))
-        features = self.neck(self.backbone(self._prepare(images)))
+        features = self.neck(self.backbone(self._preprocess(images)))
         return (
-            self.bbox_head(features, self._factor(network_intrinsic), self._rays(features, network_intrinsic)),
+            self.bbox_head(features, self._depth_factor(network_intrinsic), self._rays(features, network_intrinsic)),
             features,
             network_intrinsic,
             size,
@@ -129,7 +129,7 @@ class Mono3D(nn.Module):
         The score is class times centreness (times PGD's confidence of depth).
         """
         min_score = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
-        with evaluating(self):
+        with in_eval_mode(self):
             maps, _, network_intrinsic, size = self._maps(images, intrinsic)  # without the boxes of all places
         return self._select_detections(maps, network_intrinsic, size, threshold=min_score, best_first=True)
 
@@ -156,13 +156,13 @@ class Mono3D(nn.Module):
     ) -> list[Detections]:
         """Select and suppress detections; suppression runs on the host, with one transfer from the device."""
         with _full_precision(intrinsic):
-            flat, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
-            class_scores = self._class_scores(flat, intrinsic)
+            flat_maps, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
+            class_scores = self._class_scores(flat_maps, intrinsic)
             top_rows = self._top_places(maps, class_scores.amax(-1))
             class_scores = class_scores.gather(1, top_rows[..., None].expand(-1, -1, class_scores.shape[2]))
             image, place, label = (class_scores > threshold).nonzero(as_tuple=True)
             rows, score = top_rows[image, place], class_scores[image, place, label]
-            outputs, xy = pick(flat, image, rows), places.xy[rows]
+            outputs, xy = select_rows(flat_maps, image, rows), places.xy[rows]
             solids = centre, extent, yaw = self._solids(outputs, xy, intrinsic, image)
             image_boxes = self._boxes(outputs, xy, solids, intrinsic=intrinsic[image], size=size)
             candidates = torch.cat([centre, extent, outputs.reg[:, 7:9], outputs.direction], 1)
@@ -200,21 +200,26 @@ class Mono3D(nn.Module):
                 for image_column in image_columns
             ]
 
-    def _class_scores(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+    def _class_scores(self, flat_maps: FlatMaps, intrinsic: Tensor) -> Tensor:
         """Return scores [B, P, 10]: class times centreness, for PGD-Det times confidence of depth; see `fade`."""
-        scores = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
-        if flat.bins is not None:
-            scores = scores * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
+        scores = flat_maps.logit.sigmoid() * flat_maps.centreness.sigmoid()[..., None]
+        if flat_maps.bins is not None:
+            scores = scores * flat_maps.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
         if self.config.fade:
             scores = (
-                scores * torch.exp(-self.config.fade * self._depth(flat, intrinsic[:, None]).clamp_min(0.0))[..., None]
+                scores
+                * torch.exp(-self.config.fade * self._depth(flat_maps, intrinsic[:, None]).clamp_min(0.0))[..., None]
             )
         return scores
 
-    def _depth(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+    def _depth(self, flat_maps: FlatMaps, intrinsic: Tensor) -> Tensor:
         """Return the depth [..., P] of places, m; intrinsic [..., 3, 3], one per place or broadcast."""
-        depth = flat.reg[..., 2]
-        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(intrinsic))
+        depth = flat_maps.reg[..., 2]
+        return (
+            depth
+            if flat_maps.bins is None
+            else self.bbox_head.fuse(depth, flat_maps.bins, self._depth_factor(intrinsic))
+        )
 
     def _vote(  # noqa: PLR0917
         self, values: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor, survivors: Tensor
@@ -324,7 +329,7 @@ class Mono3D(nn.Module):
             )
 
     @torch.no_grad()
-    def doubted(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
+    def discount_centreness(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
         """Return the assignment with centreness reduced by the error of the currently predicted depth.
 
         A centreness learned from it ranks boxes by how well they are placed, as in IoU-Net (Jiang et al., ECCV 2018).
@@ -336,7 +341,9 @@ class Mono3D(nn.Module):
         """
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         with _full_precision(dense.logit):
-            depth = self._depth(pick(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image])
+            depth = self._depth(
+                select_rows(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image]
+            )
         depth_error = (depth - assignment.extra["reg"][image, place, 2]).abs()
         centreness = assignment.extra["centreness"].clone()
         centreness[image, place] *= torch.exp(-depth_error / doubt)
@@ -361,26 +368,28 @@ class Mono3D(nn.Module):
                 places,
                 assignment,
                 intrinsic,
-                factor=self._factor(intrinsic),
+                factor=self._depth_factor(intrinsic),
                 fuse=self.bbox_head.fuse,
                 reduction=reduction,
             )
 
     def _solids(
-        self, flat: FlatMaps, xy: Tensor, intrinsic: Tensor, image: Tensor | None = None
+        self, flat_maps: FlatMaps, xy: Tensor, intrinsic: Tensor, image: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return centre, size, yaw of places; intrinsic [..., 3, 3] (broadcast), or one per image and image [P]."""
-        centre2d = xy - flat.reg[..., :2]
+        centre2d = xy - flat_maps.reg[..., :2]
         place_intrinsic = intrinsic if image is None else intrinsic[image]
-        depth = self._depth(flat, place_intrinsic)
+        depth = self._depth(flat_maps, place_intrinsic)
         centre = unproject(torch.cat([centre2d, depth[..., None]], -1), intrinsic, image)
-        direction = flat.direction.argmax(-1) if self.config.heading == "bins" else None
-        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset)
-        return centre, flat.reg[..., 3:6], yaw
+        direction = flat_maps.direction.argmax(-1) if self.config.heading == "bins" else None
+        yaw = global_yaw(
+            flat_maps.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset
+        )
+        return centre, flat_maps.reg[..., 3:6], yaw
 
     def _boxes(
         self,
-        flat: FlatMaps,
+        flat_maps: FlatMaps,
         xy: Tensor,
         solids: tuple[Tensor, Tensor, Tensor],
         *,
@@ -389,7 +398,7 @@ class Mono3D(nn.Module):
     ) -> Tensor:
         """Return 2D boxes [..., P, 4] at the image's pixel edges: PGD's own, else of the solids' corners."""
         if self.config.pgd:
-            box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
+            box = torch.cat([xy - flat_maps.reg[..., 9:11], xy + flat_maps.reg[..., 11:13]], -1)
         else:
             box = hull(project(solid_corners(*solids), intrinsic[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
@@ -411,14 +420,14 @@ class Mono3D(nn.Module):
         return next(self.parameters()).dtype
 
     def _scale(self, size: tuple[int, int], template: Tensor) -> Tensor:
-        return scale_of(size_inside(size, self.config.input_width), size, template)[:2]
+        return input_scale(resized_size(size, self.config.input_width), size, template)[:2]
 
     def _rows_above(self, size: tuple[int, int]) -> int:
         """Return the number of rows added above the resized image, see `Mono3DConfig.trained_width`."""
         trained = self.config.trained_width
         if trained is None or self.config.input_width == trained:
             return 0
-        heights = [size_inside(size, width)[0] for width in (trained, self.config.input_width)]
+        heights = [resized_size(size, width)[0] for width in (trained, self.config.input_width)]
         return round(self.config.horizon * (heights[0] - heights[1])) % MULTIPLE
 
     def _scale_intrinsic(self, intrinsic: Tensor, size: tuple[int, int], scale: Tensor) -> Tensor:
@@ -428,7 +437,7 @@ class Mono3D(nn.Module):
         added = intrinsic.new_tensor([[0.0, 0.0, 0.0], [0.0, 0.0, self._rows_above(size)]])
         return torch.cat([intrinsic[:, :2] * scale[:, None] + added, intrinsic[:, 2:]], 1)
 
-    def _factor(self, intrinsic: Tensor) -> Tensor | None:
+    def _depth_factor(self, intrinsic: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:
             return None
         return intrinsic[..., 0, 0] / self.config.virtual_focal
@@ -449,11 +458,11 @@ class Mono3D(nn.Module):
             level_rays.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
         return level_rays
 
-    def _prepare(self, images: Tensor) -> Tensor:
+    def _preprocess(self, images: Tensor) -> Tensor:
         """Normalise images as BGR in 0..255 less the mean, and pad with 0 right, below and above."""
         images = images.to(self._dtype())
         size = (images.shape[2], images.shape[3])
-        resized = size_inside(size, self.config.input_width)
+        resized = resized_size(size, self.config.input_width)
         if resized != size:
             is_downscaled = resized[0] < size[0]
             images = functional.interpolate(

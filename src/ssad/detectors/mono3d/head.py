@@ -20,7 +20,7 @@ BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
 YAW = 3  # index of the yaw among the parts of the regression
 
 
-class Unit(nn.Module):
+class ConvNormUnit(nn.Module):
     """Convolution, group norm, ReLU.
 
     Attributes:
@@ -29,17 +29,17 @@ class Unit(nn.Module):
 
     compiled = False
 
-    def __init__(self, inside: int, outside: int, *, deformable: bool = False) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, deformable: bool = False) -> None:
         super().__init__()
         self.conv: nn.Module
         if deformable:
-            self.conv = DeformConv(inside, outside, bias=True)
+            self.conv = DeformConv(in_channels, out_channels, bias=True)
             nn.init.normal_(self.conv.weight, std=0.01)
         else:
-            self.conv = nn.Conv2d(inside, outside, 3, padding=1)
+            self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1)
             nn.init.normal_(self.conv.weight, std=0.01)
             nn.init.zeros_(self.conv.bias)  # type: ignore[arg-type]
-        self.gn = nn.GroupNorm(32, outside)
+        self.gn = nn.GroupNorm(32, out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [B, O, H, W] from [B, C, H, W]."""
@@ -102,11 +102,11 @@ def _to_float32(x: Tensor) -> Tensor:
     return x.float() if x.dtype in {torch.float16, torch.bfloat16} else x
 
 
-def _output_layer(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
-    conv = nn.Conv2d(inside, outside, 1)
+def _output_layer(in_channels: int, out_channels: int, *, is_rare: bool = False) -> nn.Conv2d:
+    conv = nn.Conv2d(in_channels, out_channels, 1)
     nn.init.normal_(conv.weight, std=0.01)
     # The sigmoid of -ln 99 is 0.01.
-    nn.init.constant_(conv.bias, -math.log(99.0) if rare else 0.0)  # type: ignore[arg-type]
+    nn.init.constant_(conv.bias, -math.log(99.0) if is_rare else 0.0)  # type: ignore[arg-type]
     return conv
 
 
@@ -123,33 +123,38 @@ class Head(nn.Module):
         for name, in_channels in (("cls_convs", channels), ("reg_convs", channels + 2 if config.rays else channels)):
             self.add_module(
                 name,
-                nn.ModuleList([Unit(in_channels, channels), Unit(channels, channels, deformable=config.deformable)]),
+                nn.ModuleList(
+                    [
+                        ConvNormUnit(in_channels, channels),
+                        ConvNormUnit(channels, channels, deformable=config.deformable),
+                    ]
+                ),
             )
-        self.conv_cls_prev = nn.ModuleList([Unit(channels, channels)])
-        self.conv_cls = _output_layer(channels, len(MMDET3D_CLASSES), rare=True)
+        self.conv_cls_prev = nn.ModuleList([ConvNormUnit(channels, channels)])
+        self.conv_cls = _output_layer(channels, len(MMDET3D_CLASSES), is_rare=True)
         self.conv_reg_prevs = nn.ModuleList(
-            nn.ModuleList([] if part_index == 4 else [Unit(channels, channels)])
-            for part_index in range(len(config.groups))
+            nn.ModuleList([] if part_index == 4 else [ConvNormUnit(channels, channels)])
+            for part_index in range(len(config.regression_channels))
         )
-        self.conv_regs = nn.ModuleList(_output_layer(channels, size) for size in config.groups)
+        self.conv_regs = nn.ModuleList(_output_layer(channels, size) for size in config.regression_channels)
         if config.heading == "bins":
-            self.conv_dir_cls_prev = nn.ModuleList([Unit(channels, channels)])
-            self.conv_dir_cls = _output_layer(channels, 2, rare=True)
+            self.conv_dir_cls_prev = nn.ModuleList([ConvNormUnit(channels, channels)])
+            self.conv_dir_cls = _output_layer(channels, 2, is_rare=True)
         else:
             self.heading_convs = nn.ModuleList(
-                [Unit(channels + 2 if config.rays else channels, channels), Unit(channels, channels)]
+                [ConvNormUnit(channels + 2 if config.rays else channels, channels), ConvNormUnit(channels, channels)]
             )
-        self.conv_attr_prev = nn.ModuleList([Unit(channels, channels)])
-        self.conv_attr = _output_layer(channels, len(MMDET3D_ATTRIBUTES), rare=True)
+        self.conv_attr_prev = nn.ModuleList([ConvNormUnit(channels, channels)])
+        self.conv_attr = _output_layer(channels, len(MMDET3D_ATTRIBUTES), is_rare=True)
         centreness_channels = max(channels // 4, 32)
-        self.conv_centerness_prev = nn.ModuleList([Unit(channels, centreness_channels)])
+        self.conv_centerness_prev = nn.ModuleList([ConvNormUnit(channels, centreness_channels)])
         self.conv_centerness = _output_layer(centreness_channels, 1)
         self.scales = nn.ModuleList(
             nn.ModuleList(Scale() for _ in range(4 if config.pgd else 3)) for _ in config.strides
         )
         if config.pgd:
-            self.conv_depth_cls_prev = nn.ModuleList([Unit(channels, channels)])
-            self.conv_depth_cls = _output_layer(channels, BINS, rare=True)
+            self.conv_depth_cls_prev = nn.ModuleList([ConvNormUnit(channels, channels)])
+            self.conv_depth_cls = _output_layer(channels, BINS, is_rare=True)
             self.fuse_lambda = nn.Parameter(torch.tensor(1e-4))
         if config.start is not None:
             with torch.no_grad():

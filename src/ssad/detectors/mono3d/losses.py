@@ -23,7 +23,7 @@ Fuse = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 def losses(
     config: Mono3DConfig,
-    flat: FlatMaps,
+    flat_maps: FlatMaps,
     places: PlaceGrid,
     assignment: Assignment,
     intrinsic: Tensor,
@@ -36,7 +36,7 @@ def losses(
 
     Args:
         config: The configuration of the detector.
-        flat: Outputs of the head.
+        flat_maps: Outputs of the head.
         places: Places of the pictures.
         assignment: From `ssad.detectors.mono3d.targets`.
         intrinsic: Intrinsics of the network's input [B, 3, 3].
@@ -51,10 +51,10 @@ def losses(
     label = assignment.label
     image, place = (label >= 0).nonzero(as_tuple=True)
     total = _LossReducer(image, len(label), reduction)
-    target = assignment.extra["reg"][image, place].to(flat.reg.dtype)
-    centreness = assignment.extra["centreness"][image, place].to(flat.reg.dtype)
-    loss_by_name = {"cls": total.classes(flat.logit, label)}
-    regression = flat.reg[image, place]
+    target = assignment.extra["reg"][image, place].to(flat_maps.reg.dtype)
+    centreness = assignment.extra["centreness"][image, place].to(flat_maps.reg.dtype)
+    loss_by_name = {"cls": total.classes(flat_maps.logit, label)}
+    regression = flat_maps.reg[image, place]
     stride = places.stride[place]
     code_weights = regression.new_tensor(config.code_weights)
     depth_unit = factor[image] if factor is not None else torch.ones_like(stride)
@@ -64,7 +64,7 @@ def losses(
         return total.mean((elements * code_weights[first_code : first_code + value.shape[1]]).sum(1))
 
     depth = regression[:, 2]
-    bins = None if flat.bins is None else flat.bins[image, place]
+    bins = None if flat_maps.bins is None else flat_maps.bins[image, place]
     if bins is not None:
         depth = fuse(depth, bins, depth_unit if factor is not None else None)
     loss_by_name["offset"] = smooth(regression[:, :2] / stride[:, None], target[:, :2], 0)
@@ -74,7 +74,7 @@ def losses(
     loss_by_name["velo"] = smooth(
         torch.where(is_known, regression[:, 7:9], 0.0), torch.where(is_known, velocity, 0.0), 7
     )
-    true_yaw, direction = target[:, 6], flat.direction[image, place]
+    true_yaw, direction = target[:, 6], flat_maps.direction[image, place]
     if config.heading == "vectors":
         front_vector, axis = torch.split(vectors_of_yaw(true_yaw), 2, 1)
         axis_loss = functional.smooth_l1_loss(direction[:, 2:], axis, beta=BETA, reduction="none")
@@ -95,11 +95,11 @@ def losses(
         direction_bin = (wrapped / torch.pi).floor().long().clamp(0, 1)
         loss_by_name["dir"] = total.mean(functional.cross_entropy(direction, direction_bin, reduction="none"))
     attribute_loss = functional.cross_entropy(
-        flat.attribute[image, place], assignment.extra["attribute"][image, place], reduction="none"
+        flat_maps.attribute[image, place], assignment.extra["attribute"][image, place], reduction="none"
     )
     loss_by_name["attr"] = total.mean(attribute_loss * centreness, centreness)
     centreness_loss = functional.binary_cross_entropy_with_logits(
-        flat.centreness[image, place], centreness, reduction="none"
+        flat_maps.centreness[image, place], centreness, reduction="none"
     )
     loss_by_name["centerness"] = total.mean(centreness_loss)
     if config.pgd:

@@ -89,14 +89,14 @@ def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float
             break
         stop = int(rows[-1]) + 1
         columns = remaining[: torch.searchsorted(remaining, ends[stop - 1])]
-        better, worse = _candidates(rows, columns, limits, area, group, threshold)
-        pairs = torch.stack([better, worse])
-        parts = [pairs[:, start_pair : start_pair + PAIRS] for start_pair in range(0, max(len(better), 1), PAIRS)]
+        better_rows, worse_rows = _candidates(rows, columns, limits, area, group, threshold)
+        pairs = torch.stack([better_rows, worse_rows])
+        parts = [pairs[:, start_pair : start_pair + PAIRS] for start_pair in range(0, max(len(better_rows), 1), PAIRS)]
         overlaps = torch.cat([rotated_iou(boxes[i], boxes[j]) >= threshold for i, j in parts])
-        better, worse = better[overlaps], worse[overlaps]
-        in_block = worse < stop
-        _suppress_pairs(alive, better[in_block], worse[in_block])
-        alive[worse[alive[better]]] = False
+        better_rows, worse_rows = better_rows[overlaps], worse_rows[overlaps]
+        in_block = worse_rows < stop
+        _suppress_pairs(alive, better_rows[in_block], worse_rows[in_block])
+        alive[worse_rows[alive[better_rows]]] = False
         start = stop
     return ranking[alive]
 
@@ -115,12 +115,12 @@ def _candidates(  # noqa: PLR0917
     return rows[row_index], columns[column_index]
 
 
-def _suppress_pairs(alive: Tensor, better: Tensor, worse: Tensor) -> None:
+def _suppress_pairs(alive: Tensor, better_rows: Tensor, worse_rows: Tensor) -> None:
     """Suppress within pairs (better, worse): the one set in which each stays unless a better one that stays hits it."""
     start = alive.clone()
-    while len(better):
+    while len(better_rows):
         after = start.clone()
-        after[worse[alive[better]]] = False
+        after[worse_rows[alive[better_rows]]] = False
         if torch.equal(after, alive):
             return
         alive.copy_(after)

@@ -63,12 +63,12 @@ def assign(
         }
         return Assignment(no_label, no_label.clone(), tuple(truth), extra)
     label, owner, extra = _assign_places(
-        config, places, _pad(truth, device, dtype), intrinsic, scale, rows_above=rows_above
+        config, places, _pad_objects(truth, device, dtype), intrinsic, scale, rows_above=rows_above
     )
     return Assignment(label, owner, tuple(truth), extra)
 
 
-class _Padded(NamedTuple):
+class _PaddedObjects(NamedTuple):
     """Objects of B images side by side, Q of each.
 
     Attributes:
@@ -85,7 +85,7 @@ class _Padded(NamedTuple):
     attribute: Tensor
 
 
-def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _Padded:
+def _pad_objects(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _PaddedObjects:
     solids = [image_truth.solid for image_truth in truth if image_truth.solid is not None]
 
     def side_by_side(values: Sequence[Tensor]) -> Tensor:
@@ -96,7 +96,7 @@ def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _P
         torch.ones_like(image_truth.label, dtype=torch.bool) if image_truth.crowd is None else ~image_truth.crowd
         for image_truth in truth
     ]
-    return _Padded(
+    return _PaddedObjects(
         side_by_side(real),
         side_by_side([image_truth.label for image_truth in truth]),
         side_by_side([image_truth.box for image_truth in truth]),
@@ -109,7 +109,13 @@ def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _P
 
 
 def _assign_places(
-    config: Mono3DConfig, places: PlaceGrid, objects: _Padded, intrinsic: Tensor, scale: Tensor, *, rows_above: int
+    config: Mono3DConfig,
+    places: PlaceGrid,
+    objects: _PaddedObjects,
+    intrinsic: Tensor,
+    scale: Tensor,
+    *,
+    rows_above: int,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return label and owner [B, P] of every place, and its target values."""
     centre = project(objects.centre, intrinsic[:, None])  # [B, Q, 2] in the network's input

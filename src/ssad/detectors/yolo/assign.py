@@ -62,7 +62,7 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
         boxes.append(image_truth.box.detach().to(scale.device, scale.dtype))
         crowd = image_truth.crowd if image_truth.crowd is not None else torch.zeros(count, dtype=torch.bool)
         crowds.append(crowd.to(scale.device, torch.bool))
-    label, box, crowd, real = _padded(labels, boxes, crowds)
+    label, box, crowd, real = _pad_columns(labels, boxes, crowds)
     is_invalid = (label < 0) | (label >= classes)
     is_invalid |= ~(box.isfinite().all(-1) & (box[..., 2:] > box[..., :2]).all(-1))
     if bool((is_invalid & real).any()):
@@ -75,7 +75,7 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
     return Targets(label, box * scale, real, crowd, any(image_truth.crowd is not None for image_truth in truth))
 
 
-def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
+def _pad_columns(*columns: list[Tensor]) -> tuple[Tensor, ...]:
     """Pad each column, a tensor [Q, ...] per image, to [B, largest Q, ...]; return these and a mask of the real rows.
 
     Few steps for all images: one for each image is what a GPU would wait for.

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, resize_and_pad, scale_of, size_inside
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, input_scale, resize_and_pad, resized_size
 from ssad.detectors.yolo.assign import label_places, match_best, match_near
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import CellGrid, decode, flatten, make_grid, select
-from ssad.detectors.yolo.loss import Answers, Reduction, losses_v3, losses_v5
+from ssad.detectors.yolo.loss import LossInputs, Reduction, losses_v3, losses_v5
 from ssad.detectors.yolo.models import YoloSpec, build_network
 
 MULTIPLE = 32
@@ -75,7 +75,7 @@ class Yolo(Adapter):
             ConfigError: The images have another shape or type.
         """
         size = check_images(self.name, images, min_count=0)
-        input_size = size_inside(size, self.input_width)
+        input_size = resized_size(size, self.input_width)
         images = images.to(next(self.network.parameters()).dtype)
         raw, neck = self.network(resize_and_pad(images, input_size, multiple=MULTIPLE, grey=self.spec.grey))
         grid = self._grid([(level_map.shape[2], level_map.shape[3]) for level_map in raw])
@@ -130,27 +130,27 @@ class Yolo(Adapter):
         grid = self._grid_of(dense)
         scale = self._scale(dense.size, dense.box)
         raw = flatten(dense.maps["raw"], self.anchors.shape[1])
-        loss_inputs = Answers(
+        loss_inputs = LossInputs(
             raw[..., :4],
             dense.box * scale,
             dense.quality,
             dense.logit,
             assignment.label,
             assignment.extra["box"].to(scale) * scale,
-            self._padded(dense.size),
+            self._padded_size(dense.size),
         )
         loss_reduction: Reduction = reduction
         if self.spec.rule == "v3":
             return losses_v3(loss_inputs, grid, box_loss=self.spec.box_loss, reduction=loss_reduction)
         return losses_v5(loss_inputs, grid, reduction=loss_reduction)
 
-    def _padded(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _padded_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return height and width of the network's input."""
-        height, width = size_inside(size, self.input_width)
+        height, width = resized_size(size, self.input_width)
         return -(-height // MULTIPLE) * MULTIPLE, -(-width // MULTIPLE) * MULTIPLE
 
     def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
-        return scale_of(size_inside(size, self.input_width), size, like)
+        return input_scale(resized_size(size, self.input_width), size, like)
 
     def _grid(self, shapes: list[tuple[int, int]]) -> CellGrid:
         # Half precision would round anchors and cells of large images.

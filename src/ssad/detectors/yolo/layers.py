@@ -31,11 +31,11 @@ class ConvUnit(nn.Module):
 class Residual(nn.Module):
     """1x1 to `hidden` channels, 3x3 back to the input's channels; the input is added if `add`."""
 
-    def __init__(self, channels: int, hidden: int, *, smooth: bool, add: bool = True) -> None:
+    def __init__(self, channels: int, hidden_channels: int, *, smooth: bool, use_shortcut: bool = True) -> None:
         super().__init__()
-        self.reduce = ConvUnit(channels, hidden, smooth=smooth)
-        self.expand = ConvUnit(hidden, channels, kernel=3, smooth=smooth)
-        self.add = add
+        self.reduce = ConvUnit(channels, hidden_channels, smooth=smooth)
+        self.expand = ConvUnit(hidden_channels, channels, kernel=3, smooth=smooth)
+        self.add = use_shortcut
 
     def forward(self, x: Tensor) -> Tensor:
         """Return a map [B, c, h, w] of the input's shape."""
@@ -46,13 +46,15 @@ class Residual(nn.Module):
 class C3(nn.Module):
     """Cross-stage partial block of three convolutions: half the channels pass the residual blocks, half go round."""
 
-    def __init__(self, inputs: int, outputs: int, *, repeats: int, add: bool = True) -> None:
+    def __init__(self, inputs: int, outputs: int, *, repeats: int, use_shortcut: bool = True) -> None:
         super().__init__()
         half = outputs // 2
         self.through = ConvUnit(inputs, half, smooth=True)
         self.past = ConvUnit(inputs, half, smooth=True)
         self.merge = ConvUnit(2 * half, outputs, smooth=True)
-        self.blocks = nn.Sequential(*(Residual(half, half, smooth=True, add=add) for _ in range(repeats)))
+        self.blocks = nn.Sequential(
+            *(Residual(half, half, smooth=True, use_shortcut=use_shortcut) for _ in range(repeats))
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [B, o, h, w] from [B, i, h, w]."""

@@ -23,7 +23,7 @@ BALANCE = (4.0, 1.0, 0.4)
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class LossInputs:
     """Predictions and targets that the losses compare.
 
     Attributes:
@@ -61,7 +61,7 @@ def ciou(box: Tensor, target: Tensor) -> Tensor:
     return overlap - centre_distance / ((enclosing_size**2).sum(-1) + eps) - weight * aspect
 
 
-def losses_v3(answers: Answers, grid: CellGrid, *, box_loss: str, reduction: Reduction) -> dict[str, Tensor]:
+def losses_v3(loss_inputs: LossInputs, grid: CellGrid, *, box_loss: str, reduction: Reduction) -> dict[str, Tensor]:
     """Sums over the places of an image, mean over images ("image": each image's own).
 
     obj: cross-entropy of objectness at all places that are not ignored; cls: cross-entropy of each class where an
@@ -69,46 +69,46 @@ def losses_v3(answers: Answers, grid: CellGrid, *, box_loss: str, reduction: Red
     (half the squared errors of sigmoid(x), sigmoid(y), w, h: their gradient is the paper's) or "ciou", 1 - CIoU, which
     is not the paper's but trains to tighter boxes.
     """
-    image, place = (answers.label >= 0).nonzero(as_tuple=True)
-    target = answers.target[image, place]
-    image_share = (target[:, 2:] - target[:, :2]).prod(-1) / (answers.size[0] * answers.size[1])
+    image, place = (loss_inputs.label >= 0).nonzero(as_tuple=True)
+    target = loss_inputs.target[image, place]
+    image_share = (target[:, 2:] - target[:, :2]).prod(-1) / (loss_inputs.size[0] * loss_inputs.size[1])
     if box_loss == "squares":
-        raw = answers.raw[image, place]
+        raw = loss_inputs.raw[image, place]
         loss_part = (target[:, :2] + target[:, 2:]) / 2 / grid.stride[place, None] - grid.cell[place]
         log_size = ((target[:, 2:] - target[:, :2]) / grid.anchor[place]).log()
         box = 0.5 * (((raw[:, :2].sigmoid() - loss_part) ** 2).sum(-1) + ((raw[:, 2:] - log_size) ** 2).sum(-1))
     else:
-        box = 1 - ciou(answers.box[image, place], target)
-    is_object = (answers.label >= 0).to(answers.objectness.dtype)
-    is_counted = answers.label != -2
-    objectness_loss = cross_entropy(answers.objectness, is_object, reduction="none")
+        box = 1 - ciou(loss_inputs.box[image, place], target)
+    is_object = (loss_inputs.label >= 0).to(loss_inputs.objectness.dtype)
+    is_counted = loss_inputs.label != -2
+    objectness_loss = cross_entropy(loss_inputs.objectness, is_object, reduction="none")
     loss_parts = {
         "box": sum_by_image(box * (2 - image_share), image, len(is_object)),
         "obj": torch.where(is_counted, objectness_loss, 0.0).sum(1),
-        "cls": sum_by_image(_class_loss(answers, image, place).sum(-1), image, len(is_object)),
+        "cls": sum_by_image(_class_loss(loss_inputs, image, place).sum(-1), image, len(is_object)),
     }
     return loss_parts if reduction == "image" else {name: loss_part.mean() for name, loss_part in loss_parts.items()}
 
 
-def losses_v5(answers: Answers, grid: CellGrid, *, reduction: Reduction) -> dict[str, Tensor]:
+def losses_v5(loss_inputs: LossInputs, grid: CellGrid, *, reduction: Reduction) -> dict[str, Tensor]:
     """Means over places, summed over levels (the source multiplies by the size of the batch as well; this does not).
 
     box: 0.05 * (1 - CIoU) where an object is; obj: cross-entropy of objectness with CIoU as the target (no gradient),
     levels weighted 4, 1, 0.4, in all by the area over 640 x 640; cls: 0.5 * C / 80 * cross-entropy of the classes.
     """
-    batch, levels = len(answers.label), len(grid.strides)
-    image, place = (answers.label >= 0).nonzero(as_tuple=True)
-    overlap = ciou(answers.box[image, place], answers.target[image, place])
+    batch, levels = len(loss_inputs.label), len(grid.strides)
+    image, place = (loss_inputs.label >= 0).nonzero(as_tuple=True)
+    overlap = ciou(loss_inputs.box[image, place], loss_inputs.target[image, place])
     # the means at a level run over the batch's objects, or over the image's
     level_group = image * levels + grid.level[place]
-    class_loss = _class_loss(answers, image, place).mean(-1)
+    class_loss = _class_loss(loss_inputs, image, place).mean(-1)
     object_count = sum_by_image(torch.ones_like(overlap), level_group, batch * levels).view(batch, levels)
     box = sum_by_image(1 - overlap, level_group, batch * levels).view(batch, levels)
     cls = sum_by_image(class_loss, level_group, batch * levels).view(batch, levels)
-    target_objectness = torch.zeros_like(answers.objectness)
+    target_objectness = torch.zeros_like(loss_inputs.objectness)
     target_objectness[image, place] = overlap.detach().clamp(min=0)
-    objectness_loss = cross_entropy(answers.objectness, target_objectness, reduction="none")
-    objectness_loss = torch.where(answers.label != -2, objectness_loss, 0.0)
+    objectness_loss = cross_entropy(loss_inputs.objectness, target_objectness, reduction="none")
+    objectness_loss = torch.where(loss_inputs.label != -2, objectness_loss, 0.0)
     weight = torch.tensor(BALANCE[:levels], device=objectness_loss.device, dtype=objectness_loss.dtype)
     obj = torch.stack([objectness_loss[:, level_places].mean(1) for level_places in _levels(grid)], -1) * weight
     if reduction == "batch":
@@ -116,16 +116,16 @@ def losses_v5(answers: Answers, grid: CellGrid, *, reduction: Reduction) -> dict
     object_count = object_count.clamp(min=1)
     return {
         "box": 0.05 * (box / object_count).sum(-1),
-        "obj": answers.size[0] * answers.size[1] / 640**2 * obj.sum(-1),
-        "cls": 0.5 * answers.logit.shape[-1] / 80 * (cls / object_count).sum(-1),
+        "obj": loss_inputs.size[0] * loss_inputs.size[1] / 640**2 * obj.sum(-1),
+        "cls": 0.5 * loss_inputs.logit.shape[-1] / 80 * (cls / object_count).sum(-1),
     }
 
 
-def _class_loss(answers: Answers, image: Tensor, place: Tensor) -> Tensor:
+def _class_loss(loss_inputs: LossInputs, image: Tensor, place: Tensor) -> Tensor:
     """Cross-entropy [N, C] of the class logits at these places against their labels."""
-    logit = answers.logit[image, place]
+    logit = loss_inputs.logit[image, place]
     classes = torch.arange(logit.shape[-1], device=logit.device)
-    target = (answers.label[image, place][:, None] == classes).to(logit.dtype)
+    target = (loss_inputs.label[image, place][:, None] == classes).to(logit.dtype)
     return cross_entropy(logit, target, reduction="none")
 
 

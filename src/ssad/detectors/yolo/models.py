@@ -105,9 +105,9 @@ class V3Level(nn.Module):
     def __init__(self, inputs: int, coarser: int, width: int, outputs: int) -> None:
         super().__init__()
         self.lateral = ConvUnit(coarser, width, smooth=False) if coarser else None
-        joined = inputs + (width if coarser else 0)
+        joined_channels = inputs + (width if coarser else 0)
         self.body = nn.Sequential(
-            ConvUnit(joined, width, smooth=False),
+            ConvUnit(joined_channels, width, smooth=False),
             ConvUnit(width, 2 * width, kernel=3, smooth=False),
             ConvUnit(2 * width, width, smooth=False),
             ConvUnit(width, 2 * width, kernel=3, smooth=False),
@@ -207,13 +207,13 @@ class CSPNetwork(nn.Module):
         self.stage5 = C3(c5, c5, repeats=repeats)
         self.pool = SPPF(c5, c5)
         self.lateral5 = ConvUnit(c5, c4, smooth=True)
-        self.top4 = C3(2 * c4, c4, repeats=repeats, add=False)
+        self.top4 = C3(2 * c4, c4, repeats=repeats, use_shortcut=False)
         self.lateral4 = ConvUnit(c4, c3, smooth=True)
-        self.neck3 = C3(2 * c3, c3, repeats=repeats, add=False)
+        self.neck3 = C3(2 * c3, c3, repeats=repeats, use_shortcut=False)
         self.up4 = ConvUnit(c3, c3, kernel=3, stride=2, smooth=True)
-        self.neck4 = C3(2 * c3, c4, repeats=repeats, add=False)
+        self.neck4 = C3(2 * c3, c4, repeats=repeats, use_shortcut=False)
         self.up5 = ConvUnit(c4, c4, kernel=3, stride=2, smooth=True)
-        self.neck5 = C3(2 * c4, c5, repeats=repeats, add=False)
+        self.neck5 = C3(2 * c4, c5, repeats=repeats, use_shortcut=False)
         self.heads = nn.ModuleList(nn.Conv2d(channels, outputs, 1) for channels in (c3, c4, c5))
 
     def forward(self, x: Tensor) -> tuple[Maps, Maps]:

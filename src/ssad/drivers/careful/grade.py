@@ -12,7 +12,7 @@ import numpy as np
 from ssad.core.driving import Policies, Sensor
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Bool, Episode, EpisodeTrace
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 from ssad.drivers.careful.driver import REACH, Careful
 from ssad.drivers.careful.limit import Evasions, Limit, WrongSideObserver, limit_of, manoeuvres
 from ssad.drivers.careful.models import MODELS
@@ -95,7 +95,7 @@ class _ReplayObserver:
         self.triggered[:, step] = self.scripted & (world.array("phase")[rows, self.agents] > 0)
         is_observed = (self.agents > 0) & (world.ended() == 0)
         if is_observed.any():
-            visible = in_sight(pose[:, 0, :2], world.truth(), REACH)
+            visible = is_visible(pose[:, 0, :2], world.truth(), REACH)
             self.seen[:, step] = is_observed & visible[rows, self.agents]
 
 

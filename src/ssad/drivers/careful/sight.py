@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ssad.core.driving import Belief, Observation
 from ssad.core.geometry import to_local
 from ssad.core.types import F64, AgentKind, Bool
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 from ssad.drivers.careful.encounter import Encounter
 
 BEHIND, BEYOND = 20.0, 80.0  # m of straight extension before the first and after the last point of the route
@@ -98,7 +98,7 @@ def encounters(
         The encounters [N, K], the visibility of the agents, and the updated `moved`.
     """
     belief: Belief = view.readings["truth"]
-    visible = in_sight(view.pose[:, :2], belief, reach) & (belief.kind != AgentKind.NONE)
+    visible = is_visible(view.pose[:, :2], belief, reach) & (belief.kind != AgentKind.NONE)
     encounter = encounters_on_paths(
         path,
         half_extent=half,

@@ -13,9 +13,9 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, AgentKind, Episode
-from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
-from ssad.drivers.perceiving.eyes import PerfectEyes
-from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restored, snapshot_of
+from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restore_part, snapshot_part
+from ssad.drivers.perceiving.perceivers import PerfectPerceiver
 from ssad.drivers.perceiving.sensors import sensors_of
 from ssad.drivers.perceiving.tracks import check_tracks
 from ssad.rendering.onboard import Onboard
@@ -113,9 +113,9 @@ def check_tracker(make: Callable[[], Tracker], *, episodes: Sequence[Episode], l
     tracker, half = make(), looks // 2
     tracker.reset(list(episodes))
     _track_scenes(tracker, scenes, range(half))
-    saved = snapshot_of(tracker)
+    saved = snapshot_part(tracker)
     ends = _track_scenes(tracker, scenes, range(half, looks))
-    tracker = restored(tracker, saved)
+    tracker = restore_part(tracker, saved)
     _require(_track_scenes(tracker, scenes, range(half, looks)) == ends, "a restored snapshot continues as before")
 
 
@@ -136,7 +136,7 @@ def check_planner(make: Callable[[], Planner], simulator: MakeSimulator, *, epis
     assignment = list(range(min(episodes, 4)))
 
     def run(part: Planner, order: Sequence[int]) -> list[bytes]:
-        driver = _ControlledDriver(PerfectEyes(), planner=part)
+        driver = _ControlledDriver(PerfectPerceiver(), planner=part)
         world = simulator(order)
         loop = Loop(world, {0: driver})
         loop.reset()
@@ -152,7 +152,7 @@ def check_planner(make: Callable[[], Planner], simulator: MakeSimulator, *, epis
     _require(run(make(), assignment[:1]) == reference[:1], "a scene alone is driven as it is in a batch")
 
 
-class _ControlledDriver(Perceiving):
+class _ControlledDriver(PerceivingDriver):
     """Driver whose planner's controls are checked."""
 
     def act(self, view: Observation) -> F32:
@@ -204,9 +204,9 @@ def _run_guarded(step: Callable[[], None]) -> None:
         raise PartCheckError(f"what it returns is as its protocol says: {error}") from error
 
 
-def _loop(
+def _make_loop(
     perceiver: Perceiver, world: Simulator, sensors: Mapping[str, Sensor] | None
-) -> tuple[Loop, Perceiving, list[list[bytes | None]]]:
+) -> tuple[Loop, PerceivingDriver, list[list[bytes | None]]]:
     """Return a loop in which a perceiver looks at every step, its driver, and the record of its looks by scene."""
     looks: list[list[bytes | None]] = [[] for _ in range(world.batch)]
 
@@ -218,7 +218,7 @@ def _loop(
             looks[event.scene].append(None if objects is None else b"".join(column.tobytes() for column in columns))
 
     guarded = cast(Perceiver, _GuardedPerceiver(perceiver))
-    driver = Perceiving(guarded, rate=1.0 / world.dt, latency=0.0, watch=watch)
+    driver = PerceivingDriver(guarded, rate=1.0 / world.dt, latency=0.0, watch=watch)
     available = sensors_of(perceiver, Onboard()) if sensors is None else dict(sensors)
     loop = Loop(world, {0: driver}, sensors=available)
     loop.reset()
@@ -229,14 +229,14 @@ def _record_looks(
     perceiver: Perceiver, world: Simulator, steps: int, sensors: Mapping[str, Sensor] | None
 ) -> list[list[bytes | None]]:
     """Return the objects of each look, [B][looks]; None without a reading."""
-    loop, _, looks = _loop(perceiver, world, sensors)
+    loop, _, looks = _make_loop(perceiver, world, sensors)
     for _ in range(min(steps, step_limit(world))):
         _run_guarded(loop.step)
     return looks
 
 
 def _check_snapshot(perceiver: Perceiver, world: Simulator, steps: int, sensors: Mapping[str, Sensor] | None) -> None:
-    loop, driver, looks = _loop(perceiver, world, sensors)
+    loop, driver, looks = _make_loop(perceiver, world, sensors)
     for _ in range(steps // 2):
         _run_guarded(loop.step)
     saved = cast(Reproducible, world).snapshot(), driver.snapshot_batch()

@@ -30,14 +30,14 @@ from ssad.drivers.perceiving.parts import (
     Planner,
     Tracker,
     cameras_of,
-    restored,
-    snapshot_of,
-    without_truth,
+    hide_truth,
+    restore_part,
+    snapshot_part,
 )
 from ssad.drivers.perceiving.planner import AutopilotPlanner
-from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.repair import RepairedAgents
 from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs, sign_labels
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, TrackerSettings
 from ssad.drivers.perceiving.tracks import belief_from_tracks, check_tracks
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class TrackingEvent:
     tracks: Tracks
 
 
-class Perceiving:
+class PerceivingDriver:
     """Driver that perceives: by default the Autopilot on the belief of a perceiver.
 
     With the planner of the Autopilot it has the method `believe` of `ssad.core.driving.Believer`; with another one its
@@ -116,18 +116,18 @@ class Perceiving:
         tracker: Tracker | None = None,
         planner: Planner | None = None,
         lifting: Lifting | None = None,
-        tracking: Tracking | None = None,
+        tracking: TrackerSettings | None = None,
         rate: float = 5.0,
         latency: float = 0.1,
         watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
-        repair: Repair | None = None,
+        repair: RepairedAgents | None = None,
         signs: SignReading | None = None,
     ) -> None:
         if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
             raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
         if tracker is not None and tracking is not None:
             raise ConfigError("perceiving takes a tracker, or settings of the built-in one (tracking), not both")
-        self.perceiver, self.lifting, self.tracking = perceiver, lifting or Lifting(), tracking or Tracking()
+        self.perceiver, self.lifting, self.tracking = perceiver, lifting or Lifting(), tracking or TrackerSettings()
         self.tracker: Tracker = tracker or KalmanTracker(self.tracking, 0)
         self.planner: Planner = planner or AutopilotPlanner()
         self.controller: Controller = getattr(self.planner, "controller", Controller.EXTERNAL)
@@ -186,15 +186,15 @@ class Perceiving:
         Single episodes cannot be told apart in it, so the driver is no `ssad.core.driving.Branching`.
         """
         signs = None if self._signs is None else self._signs.snapshot()
-        parts = [snapshot_of(part) for part in (self.perceiver, self.tracker, self.planner)]
+        parts = [snapshot_part(part) for part in (self.perceiver, self.tracker, self.planner)]
         return parts, self._looks.copy(), list(self._waiting), signs
 
     def restore_batch(self, snapshot: Any) -> None:
         """Continue from an earlier snapshot of the same batch."""
         (perceiver, tracker, planner), look_counts, pending, sign_state = snapshot
-        self.perceiver = restored(self.perceiver, perceiver)
-        self.tracker = restored(self.tracker, tracker)
-        self.planner = restored(self.planner, planner)
+        self.perceiver = restore_part(self.perceiver, perceiver)
+        self.tracker = restore_part(self.tracker, tracker)
+        self.planner = restore_part(self.planner, planner)
         self._looks, self._waiting = look_counts.copy(), list(pending)
         if self._signs is not None:
             self._signs.restore(sign_state)
@@ -207,7 +207,7 @@ class Perceiving:
         """
         if self.controller == Controller.AUTOPILOT:
             raise RuntimeError("the Autopilot runs inside the world")
-        return self.planner.plan(without_truth(view, readings=False), self._perceived_belief(view))
+        return self.planner.plan(hide_truth(view, readings=False), self._perceived_belief(view))
 
     def _perceived_belief(self, view: Observation) -> Belief:
         """Return the tracked objects around the egos."""
@@ -229,13 +229,13 @@ class Perceiving:
 
     def _perceive_rows(self, view: Observation, rows: I64, now: F64) -> list[PerceptionEvent]:
         """Return the sightings of some rows at the present time."""
-        percepts = self.perceiver.perceive(without_truth(view, readings=True), rows)
+        percepts = self.perceiver.perceive(hide_truth(view, readings=True), rows)
         scenes = view.scene[rows].astype(np.int64)
         ego_poses = upright_poses(view.pose[rows].astype(np.float64))
         if isinstance(percepts, Mapping):
-            parts, without_reading, signs = self._from_images(percepts, ego_poses, scenes)
+            parts, without_reading, signs = self._objects_from_images(percepts, ego_poses, scenes)
         else:
-            parts, without_reading, signs = self._from_boxes(percepts, ego_poses, scenes)
+            parts, without_reading, signs = self._objects_from_boxes(percepts, ego_poses, scenes)
         # Neighbouring sensors overlap, so an object can be detected twice.
         merged_objects = merge_duplicates(Objects.cat(parts), self.lifting.merge)
         events = []
@@ -260,7 +260,7 @@ class Perceiving:
                 self.watch(events[-1])
         return events
 
-    def _from_images(
+    def _objects_from_images(
         self, detections_by_camera: Mapping[str, Sequence[Detections | None]], ego_poses: F64, scenes: I64
     ) -> tuple[list[Objects], Bool, list[list[F64]]]:
         """Return objects, rows [n] without an image, and positions of stop signs by row, of detections in images."""
@@ -289,7 +289,7 @@ class Perceiving:
                     )
         return parts, without_image, signs
 
-    def _from_boxes(
+    def _objects_from_boxes(
         self, boxes_by_row: Any, ego_poses: F64, scenes: I64
     ) -> tuple[list[Objects], Bool, list[list[F64]]]:
         """Return objects, rows [n] without a reading, and positions of stop signs by row, of boxes around the egos."""

@@ -11,7 +11,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import I64, Objects, no_objects
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64
-from ssad.drivers.perceiving.lift import Lifting, position_spread
+from ssad.drivers.perceiving.lift import Lifting, position_covariance
 from ssad.drivers.perceiving.objects import KINDS
 
 LEAST_SIZE = 0.2  # m, so that no object has an empty outline
@@ -28,7 +28,7 @@ class EgoBoxes:
         velocity: [M, 2] over ground along x and y, m/s; NaN where unknown.
         label: [M] index into the `classes` of the perceiver.
         score: [M] confidence, 0 to 1.
-        spread: [M, 2, 2] covariance of x and y, m^2; None: that of `ssad.drivers.perceiving.lift.Lifting`, which
+        covariance: [M, 2, 2] covariance of x and y, m^2; None: that of `ssad.drivers.perceiving.lift.Lifting`, which
             grows with the distance.
     """
 
@@ -38,7 +38,7 @@ class EgoBoxes:
     velocity: F64
     label: I64
     score: F64
-    spread: F64 | None = None
+    covariance: F64 | None = None
 
     def __len__(self) -> int:
         return len(self.score)
@@ -56,10 +56,18 @@ def check_boxes(boxes: EgoBoxes, classes: Sequence[str], perceiver: str) -> None
         ConfigError: A column has a wrong shape, a value that is not finite or out of range; the message names it.
     """
     count = np.size(boxes.score)
-    shapes = {"centre": (3,), "size_lwh": (3,), "yaw": (), "velocity": (2,), "label": (), "score": (), "spread": (2, 2)}
+    shapes = {
+        "centre": (3,),
+        "size_lwh": (3,),
+        "yaw": (),
+        "velocity": (2,),
+        "label": (),
+        "score": (),
+        "covariance": (2, 2),
+    }
     for name, shape in shapes.items():
         value = getattr(boxes, name)
-        if value is None and name == "spread":
+        if value is None and name == "covariance":
             continue
         if np.shape(value) != (count, *shape):
             raise ConfigError(f"perceiver {perceiver}: {name} has shape {np.shape(value)}; expected {(count, *shape)}")
@@ -100,10 +108,10 @@ def boxes_in_world(
         rotation, count = pose[:2, :2], len(order)
         ego_pose = np.broadcast_to(pose, (count, 4, 4))
         place = _rotate(np.asarray(ego_boxes.centre, np.float64)[order, :2], rotation) + pose[:2, 3]
-        if ego_boxes.spread is None:
-            spread, _ = position_spread(place, ego_pose, settings)
+        if ego_boxes.covariance is None:
+            spread, _ = position_covariance(place, ego_pose, settings)
         else:
-            spread = rotation @ np.asarray(ego_boxes.spread, np.float64)[order] @ rotation.T
+            spread = rotation @ np.asarray(ego_boxes.covariance, np.float64)[order] @ rotation.T
         yaw = np.asarray(ego_boxes.yaw, np.float64)[order] + np.arctan2(rotation[1, 0], rotation[0, 0])
         objects = Objects(
             np.full(count, scene, np.int64),

@@ -36,40 +36,42 @@ def predict(mean: F64, covariance: F64, seconds: F64, density: float) -> tuple[F
     ) + density * noise
 
 
-def update(mean: F64, covariance: F64, place: F64, spread: F64) -> tuple[F64, F64]:
+def update(mean: F64, covariance: F64, place: F64, measurement_covariance: F64) -> tuple[F64, F64]:
     """Update each point with a measurement, in Joseph form, which keeps the covariance positive.
 
     Args:
         mean: [N, 4].
         covariance: [N, 4, 4].
         place: [N, 2] measured.
-        spread: [N, 2, 2] covariance of the measurement.
+        measurement_covariance: [N, 2, 2] covariance of the measurement.
 
     Returns:
         Mean [N, 4] and covariance [N, 4, 4].
     """
-    innovation = covariance[:, :2, :2] + spread
+    innovation = covariance[:, :2, :2] + measurement_covariance
     gain = np.linalg.solve(innovation, covariance[:, :2, :]).transpose(0, 2, 1)
     complement = np.tile(np.eye(4), (len(mean), 1, 1))
     complement[:, :, :2] -= gain
-    posterior = complement @ covariance @ complement.transpose(0, 2, 1) + gain @ spread @ gain.transpose(0, 2, 1)
+    posterior = complement @ covariance @ complement.transpose(
+        0, 2, 1
+    ) + gain @ measurement_covariance @ gain.transpose(0, 2, 1)
     return mean + (gain @ (place - mean[:, :2])[..., None])[..., 0], posterior
 
 
-def distance(mean: F64, covariance: F64, place: F64, spread: F64) -> F64:
+def squared_distances(mean: F64, covariance: F64, place: F64, measurement_covariance: F64) -> F64:
     """Return squared Mahalanobis distances of points and measurements, pair by pair.
 
     Args:
         mean: [N, 4].
         covariance: [N, 4, 4].
         place: [N, 2].
-        spread: [N, 2, 2].
+        measurement_covariance: [N, 2, 2].
 
     Returns:
         [N].
     """
     x, y = (place - mean[:, :2]).T
-    innovation = covariance[:, :2, :2] + spread
+    innovation = covariance[:, :2, :2] + measurement_covariance
     # Closed-form inverse of the symmetric 2x2 matrix [[a, b], [b, c]].
     variance_x, covariance_xy, variance_y = (
         innovation[:, 0, 0],

@@ -103,7 +103,7 @@ def lift(
         yaw = np.arctan2(direction[:, 1], direction[:, 0])
         size = np.maximum(size_lhw[:, [0, 2]], 0.2)
         velocity = _rotate(pose, np.stack([speed[:, 0], np.zeros(len(rows)), speed[:, 1]], 1))[:, :2]
-    spread, distance = position_spread(position, pose, settings)
+    spread, distance = position_covariance(position, pose, settings)
     objects = Objects(scenes[image_index], position, spread, yaw, size, velocity, kind, score[rows].astype(np.float64))
     ranking = np.lexsort((-objects.score, image_index))
     return objects.take(ranking[distance[ranking] <= settings.reach])
@@ -160,7 +160,7 @@ def _check_finite(*arrays: F64) -> None:
         raise ConfigError("the detector returned a number that is not finite")
 
 
-def position_spread(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
+def position_covariance(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
     """Covariances [N, 2, 2] of places as seen from cameras, and distances [N]."""
     line_of_sight = place - pose[:, :2, 3]
     distance = np.linalg.norm(line_of_sight, axis=1)

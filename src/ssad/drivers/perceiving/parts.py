@@ -201,8 +201,8 @@ class Planner(Protocol):
 
 
 PERCEIVERS: Final[Mapping[str, str]] = {
-    "camera": "ssad.drivers.perceiving.eyes:camera_perceiver",
-    "truth": "ssad.drivers.perceiving.eyes:perfect_perceiver",
+    "camera": "ssad.drivers.perceiving.perceivers:camera_perceiver",
+    "truth": "ssad.drivers.perceiving.perceivers:perfect_perceiver",
 }
 TRACKERS: Final[Mapping[str, str]] = {"kalman": "ssad.drivers.perceiving.tracker:kalman_tracker"}
 PLANNERS: Final[Mapping[str, str]] = {"autopilot": "ssad.drivers.perceiving.planner:AutopilotPlanner"}
@@ -231,8 +231,8 @@ def make_perceiver(name: str, **options: Any) -> Perceiver:
         UnknownNameError: There is no such perceiver.
         ConfigError: It does not import, refuses an argument, or lacks an attribute or a method.
     """
-    target = resolve("perceiver", PERCEIVERS, Reference.of(name).name)
-    perceiver = cast(Perceiver, _part("perceiver", target, name, options))
+    target = resolve("perceiver", PERCEIVERS, Reference.parse(name).name)
+    perceiver = cast(Perceiver, _resolve_part("perceiver", target, name, options))
     for attribute in ("sensors", "classes"):
         value = getattr(perceiver, attribute)
         if isinstance(value, str) or not all(isinstance(entry, str) for entry in value):
@@ -242,23 +242,23 @@ def make_perceiver(name: str, **options: Any) -> Perceiver:
 
 def make_tracker(name: str, **options: Any) -> Tracker:
     """Return a tracker by name, entry point or "module:object"; arguments and errors as `make_perceiver`."""
-    target = resolve("tracker", TRACKERS, Reference.of(name).name)
-    return cast(Tracker, _part("tracker", target, name, options))
+    target = resolve("tracker", TRACKERS, Reference.parse(name).name)
+    return cast(Tracker, _resolve_part("tracker", target, name, options))
 
 
 def make_planner(name: str, **options: Any) -> Planner:
     """Return a planner by name, entry point or "module:object"; arguments and errors as `make_perceiver`."""
-    target = resolve("planner", PLANNERS, Reference.of(name).name)
-    planner = cast(Planner, _part("planner", target, name, options))
+    target = resolve("planner", PLANNERS, Reference.parse(name).name)
+    planner = cast(Planner, _resolve_part("planner", target, name, options))
     controller = getattr(planner, "controller", Controller.EXTERNAL)
     if controller not in (Controller.EXTERNAL, Controller.AUTOPILOT):
         raise ConfigError(f"planner '{name}': controller must be Controller.EXTERNAL or AUTOPILOT, not {controller!r}")
     return planner
 
 
-def _part(kind: str, target: Any, name: str, options: Mapping[str, Any]) -> Any:
+def _resolve_part(kind: str, target: Any, name: str, options: Mapping[str, Any]) -> Any:
     """Return the part that a class or function makes, or the object itself, with what its kind needs."""
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     arguments = {**reference.options, **options}
     if callable(target):
         try:
@@ -294,7 +294,7 @@ def part_version(kind: str, name: str, part: Any, options: Mapping[str, Any]) ->
         Hashes, separated by spaces: of the source of a part of a user and all that it imports; of the files that
         arguments name; of the weights of its detector; and its own `version`.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     versions = []
     if reference.name not in TABLES[kind]:
         target = resolve(kind, TABLES[kind], reference.name)
@@ -317,20 +317,20 @@ def cameras_of(perceiver: Perceiver) -> dict[str, Camera]:
     }
 
 
-def snapshot_of(part: Any) -> Any:
+def snapshot_part(part: Any) -> Any:
     """Return the state of a part: its own snapshot, or a deep copy of it."""
     return part.snapshot() if hasattr(part, "snapshot") else deepcopy(part)
 
 
-def restored(part: Any, snapshot: Any) -> Any:
-    """Return a part in the state of a snapshot of `snapshot_of`."""
+def restore_part(part: Any, snapshot: Any) -> Any:
+    """Return a part in the state of a snapshot of `snapshot_part`."""
     if not hasattr(part, "restore"):
         return deepcopy(snapshot)
     part.restore(snapshot)
     return part
 
 
-def without_truth(view: Observation, *, readings: bool) -> Observation:
+def hide_truth(view: Observation, *, readings: bool) -> Observation:
     """Return an observation without the true state of other agents, and without readings where asked."""
     hidden = replace(view, others=np.zeros_like(view.others), others_lane=np.zeros_like(view.others_lane))
     return hidden if readings else replace(hidden, readings={})

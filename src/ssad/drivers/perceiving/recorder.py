@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.perception import Perceived
+from ssad.core.perception import DrivePerception
 from ssad.core.types import F64, U8
 from ssad.drivers.perceiving.driver import PerceptionEvent, TrackingEvent
 
@@ -22,22 +22,22 @@ class PerceptionRecorder:
             stored.
     """
 
-    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float | None = 0.5) -> None:
-        self.cameras, self.every = cameras, every
+    def __init__(self, cameras: Mapping[str, Any], scenes: int, image_interval: float | None = 0.5) -> None:
+        self.cameras, self.every = cameras, image_interval
         self.looks: list[list[Any]] = [[] for _ in range(scenes)]
         self.known: list[list[Any]] = [[] for _ in range(scenes)]
         self._shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
         self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
 
     def __call__(self, event: PerceptionEvent | TrackingEvent) -> None:
-        """See `Perceiving`."""
+        """See `PerceivingDriver`."""
         if isinstance(event, PerceptionEvent):
             self.looks[event.scene].append((event.time, event.objects))
             if event.signs is not None:
                 self.signs[event.scene].append((event.time, event.signs))
             if self.every is not None:
                 for image in list(event.images.values())[:1]:
-                    self._keep(self._shots[event.scene], event.time, image, self.every)
+                    self._store_image(self._shots[event.scene], event.time, image, self.every)
             return
         # Tracks of all scenes come together; sorted by scene, each scene is a slice.
         tracks = event.tracks.take(np.argsort(event.tracks.scene, kind="stable"))
@@ -48,25 +48,25 @@ class PerceptionRecorder:
             self.known[scene].append((time, tracks.take(slice(first_track, last_track))))
 
     @staticmethod
-    def _keep(shots: list[tuple[float, Any]], time: float, picture: Any, every: float) -> None:
+    def _store_image(shots: list[tuple[float, Any]], time: float, picture: Any, every: float) -> None:
         """The last picture stays as it came, often on a GPU, until it is known that it is kept."""
         if len(shots) > 1 and shots[-1][0] - shots[-2][0] < every - 1e-4:
             shots[-1] = time, picture
             return
         if shots:
-            shots[-1] = shots[-1][0], _upright(shots[-1][1])
+            shots[-1] = shots[-1][0], _channels_last(shots[-1][1])
         shots.append((time, picture))
 
-    def shots(self, scene: int) -> list[tuple[float, U8]]:
+    def images(self, scene: int) -> list[tuple[float, U8]]:
         """Return the images [H, W, 3] of the driver of a scene, with their times, s."""
-        return [(time, _upright(image)) for time, image in self._shots[scene]]
+        return [(time, _channels_last(image)) for time, image in self._shots[scene]]
 
-    def perceived(self, scene: int) -> Perceived:
+    def perception(self, scene: int) -> DrivePerception:
         """Return the perception in a scene."""
-        return Perceived(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
+        return DrivePerception(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
 
 
-def _upright(picture: Any) -> U8:
+def _channels_last(picture: Any) -> U8:
     """A picture [3, H, W], or one that is [H, W, 3] already, as an array [H, W, 3] of its own."""
     if hasattr(picture, "cpu"):
         picture = picture.cpu().numpy()

@@ -12,16 +12,16 @@ from ssad.core.frames import Camera
 from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import Bool
-from ssad.core.visibility import in_sight
-from ssad.drivers.perceiving.eyes import PerfectEyes, object_boxes, project_boxes
+from ssad.core.visibility import is_visible
 from ssad.drivers.perceiving.lift import Lifting, lift
+from ssad.drivers.perceiving.perceivers import PerfectPerceiver, object_boxes, project_boxes
 
 AROUND = 5.0  # m around the object within which what was found is taken for it
 
 
 @dataclass(frozen=True, eq=False)
-class Repair:
-    """Selection of the agents whose detections are repaired, for `ssad.drivers.perceiving.driver.Perceiving`.
+class RepairedAgents:
+    """Selection of the agents whose detections are repaired, for `ssad.drivers.perceiving.driver.PerceivingDriver`.
 
     Where the object can be seen, it is found where it is, and what was found within 5 m of it and near nobody else is
     left out; where it cannot be seen, nothing changes.
@@ -48,7 +48,7 @@ class Repair:
         """
         agent = self.agents.get(int(view.scene[row]))
         truth: Belief = view.readings["truth"].rows([row])
-        if agent is None or not in_sight(view.pose[[row], :2], truth, self.reach)[0, agent]:
+        if agent is None or not is_visible(view.pose[[row], :2], truth, self.reach)[0, agent]:
             return objects
         ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
         parts = [no_objects()]
@@ -59,7 +59,7 @@ class Repair:
                 object_boxes(truth, 0, agent_mask), np.asarray(np.linalg.inv(pose), np.float64), camera
             )
             scene = view.scene[[row]].astype(np.int64)
-            parts.append(lift([projected_agent], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
+            parts.append(lift([projected_agent], camera, pose[None], scene, PerfectPerceiver.classes, settings=lifting))
         if not cameras:  # a perceiver of LiDAR or radar: its own boxes are in no image
             parts.append(_true_object(truth, agent_mask, view.scene[row], lifting))
         perfect = Objects.cat(parts).take(np.arange(min(1, sum(len(part) for part in parts))))

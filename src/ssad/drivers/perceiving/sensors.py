@@ -38,6 +38,6 @@ def sensors_of(perceiver: Perceiver, onboard: Onboard) -> dict[str, Sensor]:
         onboard: Source of the sensors.
     """
     suite = sensor_suite(perceiver)
-    sensors: dict[str, Sensor] = dict(onboard.together(suite.cameras))
+    sensors: dict[str, Sensor] = dict(onboard.group_cameras(suite.cameras))
     sensors |= {name: onboard.lidar(lidar) for name, lidar in suite.lidars.items()}
     return sensors | {name: OnboardRadar(onboard, radar) for name, radar in suite.radars.items()}

@@ -88,7 +88,7 @@ def read_signs(detections: Detections, camera: Camera, pose: F64, classes: Seque
 
 
 @dataclass(slots=True)
-class _Sign:
+class _SignTrack:
     place: F64
     hits: int
     last: float
@@ -103,7 +103,7 @@ class SignMemory:
     """
 
     settings: SignReading
-    _signs_by_scene: list[list[_Sign]] = field(default_factory=list)
+    _signs_by_scene: list[list[_SignTrack]] = field(default_factory=list)
 
     def reset(self, batch: int) -> None:
         """Forget all signs of all scenes."""
@@ -127,12 +127,12 @@ class SignMemory:
             ]
             min_distance, sign_index = min(distances, default=(np.inf, -1))
             if min_distance > reach:
-                self._signs_by_scene[scene].append(_Sign(place, 1, time))
+                self._signs_by_scene[scene].append(_SignTrack(place, 1, time))
                 updated.add(len(self._signs_by_scene[scene]) - 1)
                 continue
             sign = self._signs_by_scene[scene][sign_index]
             # nearer readings are more accurate, so the latest position replaces the earlier one
-            self._signs_by_scene[scene][sign_index] = _Sign(place, sign.hits + (sign_index not in updated), time)
+            self._signs_by_scene[scene][sign_index] = _SignTrack(place, sign.hits + (sign_index not in updated), time)
             updated.add(sign_index)
 
     def is_sign_ahead(self, scenes: I32, time: F64, pose: F32) -> U8:
@@ -155,18 +155,20 @@ class SignMemory:
         hits, last = (np.array(column) for column in zip(*((sine.hits, sine.last) for _, sine in signs), strict=True))
         yaw = pose[row, 2].astype(np.float64)
         offset, cosine, sine = place - pose[row, :2], np.cos(yaw), np.sin(yaw)
-        along, aside = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
+        forward, lateral = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
         confirmed = (hits >= self.settings.confirm) & (time[row] - last <= self.settings.memory)
-        nearby = (along > -BEHIND) & (along < AHEAD) & (np.abs(aside) < ASIDE)
+        nearby = (forward > -BEHIND) & (forward < AHEAD) & (np.abs(lateral) < ASIDE)
         is_ahead[row[confirmed & nearby]] = 1
         return is_ahead
 
     def snapshot(self) -> Any:
         """Return a copy of the memory."""
-        return [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in self._signs_by_scene]
+        return [
+            [_SignTrack(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in self._signs_by_scene
+        ]
 
     def restore(self, snapshot: Any) -> None:
         """Continue from an earlier snapshot."""
         self._signs_by_scene = [
-            [_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in snapshot
+            [_SignTrack(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in snapshot
         ]

@@ -16,8 +16,7 @@ from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
 from ssad.core.source import plugin_version
 from ssad.detectors import DETECTORS
-from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
+from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent, TrackingEvent
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     cameras_of,
@@ -26,9 +25,10 @@ from ssad.drivers.perceiving.parts import (
     make_tracker,
     part_version,
 )
-from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.perceivers import CameraPerceiver, PerfectPerceiver, nuscenes_cameras
+from ssad.drivers.perceiving.repair import RepairedAgents
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
-from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
+from ssad.drivers.perceiving.tracker import TrackerSettings, tracking_settings
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 KEYS_OF_PERCEIVER: Final = (
@@ -73,7 +73,7 @@ class PerceivingSystem(Schema):
         high, low: scores of the tracker's two stages; none: those that suit the detector.
         reads_signs: true: stop signs are read by the detector; false: they are known from the map.
         sign_memory: time that a sign is remembered after its last reading, s; none: until it has been passed.
-        missed, burst, noise, phantoms: errors of a perfect detector (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+        missed, burst, noise, phantoms: errors of a perfect detector (`PerfectPerceiver`).
         perceiver: source of detections in place of the one that the keys detector, weights, cameras, width,
             input_width, missed, burst, noise and phantoms describe (`ssad list perceivers`).
         tracker: tracker in place of the one that confirm, reserve, high and low describe (`ssad list trackers`).
@@ -111,7 +111,7 @@ class PerceivingSystem(Schema):
     @property
     def version(self) -> str:
         """Hashes of the weights and source of its detector, and versions of the parts that are named; "" without."""
-        built_in_detector = self.perceiver is None and not self.perfect
+        built_in_detector = self.perceiver is None and not self.is_perfect
         versions = []
         if built_in_detector:
             versions.append(state_hash(self._make_perceiver().detector))
@@ -124,7 +124,7 @@ class PerceivingSystem(Schema):
         return " ".join(filter(None, versions))
 
     @property
-    def perfect(self) -> bool:
+    def is_perfect(self) -> bool:
         """True if no perturbation of images reaches it: it is given the truth, or reads no camera."""
         if self.perceiver is None:
             return self.detector == "truth"
@@ -132,18 +132,23 @@ class PerceivingSystem(Schema):
         return not set(cameras_of(perceiver)) & set(perceiver.sensors)
 
     @property
-    def views(self) -> Mapping[str, Camera]:
+    def view_cameras(self) -> Mapping[str, Camera]:
         """Cameras in whose images objects count as in view; none of a perceiver without cameras."""
         return cameras_of(self._make_perceiver()) if self.perceiver else nuscenes_cameras(self.width, self.cameras)
 
     @property
-    def tracking(self) -> Tracking:
+    def tracking(self) -> TrackerSettings:
         """Settings of the built-in tracker, with the scores that suit the detector unless the suite sets them."""
         name, options = self._part("perceiver")
         detector = (options.get("detector", self.detector) if name == "camera" else "") if name else self.detector
         tracker, settings = self._part("tracker")
-        given: dict[str, Any] = {"confirm": self.confirm, "reserve": self.reserve, "high": self.high, "low": self.low}
-        return tracking_settings(detector, **(given | settings if tracker == "kalman" else given))
+        given_settings: dict[str, Any] = {
+            "confirm": self.confirm,
+            "reserve": self.reserve,
+            "high": self.high,
+            "low": self.low,
+        }
+        return tracking_settings(detector, **(given_settings | settings if tracker == "kalman" else given_settings))
 
     def check(self) -> None:
         """Validate the settings, and make the parts that are named.
@@ -183,9 +188,9 @@ class PerceivingSystem(Schema):
         self,
         watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
         *,
-        repair: Repair | None = None,
+        repair: RepairedAgents | None = None,
         device: str = "cpu",
-    ) -> Perceiving:
+    ) -> PerceivingDriver:
         """Build the driver.
 
         Args:
@@ -203,7 +208,7 @@ class PerceivingSystem(Schema):
             SignReading(confirm=self.confirm, memory=memory_seconds, score=tracking.high) if self.reads_signs else None
         )
         built_in = tracker_name in ("", "kalman")
-        driver = Perceiving(
+        driver = PerceivingDriver(
             self._make_perceiver(device),
             tracker=None if built_in else self._make_part("tracker"),
             planner=None if self.planner is None else self._make_part("planner"),
@@ -240,16 +245,18 @@ class PerceivingSystem(Schema):
                 options = {"threshold": tracking.low} | options
             return _perceiver(name, dump_json(options), device)
         cameras = nuscenes_cameras(self.width, self.cameras)
-        if self.perfect:
-            return PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
+        if self.is_perfect:
+            return PerfectPerceiver(
+                cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
+            )
         detector = _detector(self.detector, self.weights, self.input_width, device)
-        return CameraEyes(detector, cameras, threshold=tracking.low, device=device)
+        return CameraPerceiver(detector, cameras, threshold=tracking.low, device=device)
 
 
 def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
-    from ssad.detectors import loaded_detector
+    from ssad.detectors import cached_detector
 
-    return loaded_detector(name, weights=weights, device=device, input_width=width)
+    return cached_detector(name, weights=weights, device=device, input_width=width)
 
 
 @lru_cache(maxsize=4)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
+from ssad.drivers.perceiving.driver import PerceivingDriver
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     Tracker,
@@ -14,10 +13,11 @@ from ssad.drivers.perceiving.parts import (
     make_tracker,
     part_version,
 )
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking, tracking_settings
+from ssad.drivers.perceiving.perceivers import CameraPerceiver, PerfectPerceiver, nuscenes_cameras
+from ssad.drivers.perceiving.tracker import KalmanTracker, TrackerSettings, tracking_settings
 
 
-class OneCamera(Perceiving):
+class OneCamera(PerceivingDriver):
     """System with one front camera and a detector with shipped weights.
 
     Attributes:
@@ -26,10 +26,10 @@ class OneCamera(Perceiving):
 
     weights: ClassVar[str]
 
-    def __init__(self, *, width: int = 640, tracking: Tracking | None = None, **settings: Any) -> None:
+    def __init__(self, *, width: int = 640, tracking: TrackerSettings | None = None, **settings: Any) -> None:
         tracker_settings = tracking or tracking_settings(self.weights)
         super().__init__(
-            CameraEyes(self.weights, nuscenes_cameras(width), threshold=tracker_settings.low),
+            CameraPerceiver(self.weights, nuscenes_cameras(width), threshold=tracker_settings.low),
             tracking=tracker_settings,
             **settings,
         )
@@ -53,19 +53,19 @@ class Yolov5n(OneCamera):
     weights = "yolov5n"
 
 
-class Perfect(Perceiving):
+class PerfectSystem(PerceivingDriver):
     """System with one front camera and a perfect detector: the upper bound of all systems with this camera."""
 
     def __init__(self, **settings: Any) -> None:
-        super().__init__(PerfectEyes(), **settings)
+        super().__init__(PerfectPerceiver(), **settings)
 
 
-class Composed(Perceiving):
+class ComposedSystem(PerceivingDriver):
     """System of parts that are named by its arguments.
 
     In any suite: `perceiving?perceiver=my_package.eyes:Eyes&tracker=my_package.tracks:Nearest@mine`. A part may have
     a single argument of its own: `perceiver=my_package.eyes:Eyes?reach=40`. A suite of kind `gap` gives parts any
-    arguments, and so does a subclass of `Perceiving`.
+    arguments, and so does a subclass of `PerceivingDriver`.
 
     Args:
         perceiver: Name as for `ssad.drivers.perceiving.parts.make_perceiver`.
@@ -109,6 +109,6 @@ class Composed(Perceiving):
 
 def _tracker(name: str, perceiver: Perceiver) -> Tracker:
     """Return a tracker by name; the built-in one without arguments gets the scores that suit the detector."""
-    if name == "kalman" and isinstance(perceiver, CameraEyes):
+    if name == "kalman" and isinstance(perceiver, CameraPerceiver):
         return KalmanTracker(tracking_settings(perceiver.name))
     return make_tracker(name)

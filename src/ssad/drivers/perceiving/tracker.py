@@ -26,7 +26,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import I64, Objects, Tracks
 from ssad.core.registry import Reference
 from ssad.core.types import F64, I32, AgentKind, Episode
-from ssad.drivers.perceiving.kalman import distance, predict, update
+from ssad.drivers.perceiving.kalman import predict, squared_distances, update
 
 MEMORY = 0.8  # weight of the earlier sizes, kinds and headings at each hit
 SCORES = {
@@ -39,7 +39,7 @@ SURE = 2.0  # standard deviations of its speed above which the direction in whic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tracking:
+class TrackerSettings:
     """Settings of the tracker.
 
     Attributes:
@@ -76,24 +76,24 @@ class Tracking:
 
 def tracking_settings(
     detector: str, *, high: float | None = None, low: float | None = None, **settings: Any
-) -> Tracking:
+) -> TrackerSettings:
     """Return tracker settings for a detector, by default adapted to the scores that it reports.
 
     Args:
         detector: Its name, with or without options and label.
-        high: As of `Tracking`. If only one of `high` and `low` is given, the other one is adapted where they would
+        high: As of `TrackerSettings`. If only one of `high` and `low` is given, the other one is adapted where they
             cross.
-        low: As of `Tracking`.
-        settings: The other fields of `Tracking`.
+        low: As of `TrackerSettings`.
+        settings: The other fields of `TrackerSettings`.
 
     Raises:
         ConfigError: high is below low, or a setting is out of its range.
     """
-    defaults = Tracking()
-    usual_high, usual_low = SCORES.get(Reference.of(detector).name, (defaults.high, defaults.low))
+    defaults = TrackerSettings()
+    usual_high, usual_low = SCORES.get(Reference.parse(detector).name, (defaults.high, defaults.low))
     if low is None:
         low = usual_low if high is None else min(usual_low, high)
-    return Tracking(high=max(usual_high, low) if high is None else high, low=low, **settings)
+    return TrackerSettings(high=max(usual_high, low) if high is None else high, low=low, **settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +135,12 @@ class KalmanTracks:
         """Return the rows selected by indices, a mask or a slice."""
         return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
-    def at(self, time: F64, density: float) -> Self:
+    def predict_to(self, time: F64, density: float) -> Self:
         """Predict the tracks to other times [N]."""
         mean, covariance = predict(self.mean, self.covariance, time - self.time, density)
         return replace(self, time=time.copy(), mean=mean, covariance=covariance)
 
-    def reported(self) -> Tracks:
+    def to_tracks(self) -> Tracks:
         """Return the table that other parts of a driver read."""
         place, velocity = self.mean[:, :2], self.mean[:, 2:]
         return Tracks(self.scene, self.ident, place, velocity, self.yaw, self.size, self.kind, self.score)
@@ -195,8 +195,8 @@ class KalmanTracker:
         scenes: Number of scenes B.
     """
 
-    def __init__(self, settings: Tracking | None = None, scenes: int = 1) -> None:
-        self.settings = settings or Tracking()
+    def __init__(self, settings: TrackerSettings | None = None, scenes: int = 1) -> None:
+        self.settings = settings or TrackerSettings()
         self.tracks = no_kalman_tracks()
         self._track_counts = np.zeros(scenes, np.int64)
 
@@ -224,7 +224,7 @@ class KalmanTracker:
         settings, look_times = self.settings, np.full(len(self._track_counts), np.nan)
         look_times[scenes] = times
         was_looked_at = np.isfinite(look_times[self.tracks.scene])
-        tracks = self.tracks.at(
+        tracks = self.tracks.predict_to(
             np.where(was_looked_at, look_times[self.tracks.scene], self.tracks.time), settings.density
         )
         objects = objects.take(np.isfinite(look_times[objects.scene]) & (objects.score >= settings.low))
@@ -249,11 +249,11 @@ class KalmanTracker:
             rows[track_begin[pair_scene] + pair_number // object_count[pair_scene]],
             hits[object_begin[pair_scene] + pair_number % object_count[pair_scene]],
         )
-        distances = distance(
+        distances = squared_distances(
             tracks.mean[track_index],
             tracks.covariance[track_index],
             objects.place[object_index],
-            objects.spread[object_index],
+            objects.covariance[object_index],
         )
         # Clipping at the gate keeps impossible pairs from distorting the optimal assignment.
         distances = np.minimum(
@@ -289,7 +289,7 @@ class KalmanTracker:
     def _update_tracks(self, tracks: KalmanTracks, rows: I64, hits: Objects) -> KalmanTracks:
         """Update tracks with their hits."""
         columns = {column.name: getattr(tracks, column.name).copy() for column in fields(tracks)}
-        filtered = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.spread)
+        filtered = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.covariance)
         columns["mean"][rows], columns["covariance"][rows] = filtered
         axis, heading, votes = _appearance_votes(hits)
         for name, value in (("axis", axis), ("heading", heading), ("votes", votes)):
@@ -310,7 +310,7 @@ class KalmanTracker:
         has_velocity = np.asarray(np.isfinite(objects.velocity).all(1))
         mean = np.concatenate([objects.place, np.where(has_velocity[:, None], objects.velocity, 0.0)], 1)
         covariance = np.zeros((count, 4, 4))
-        covariance[:, :2, :2] = objects.spread
+        covariance[:, :2, :2] = objects.covariance
         covariance[:, 2, 2] = covariance[:, 3, 3] = self.settings.speed**2
         axis, heading, votes = _appearance_votes(objects)
         first_hits, no_misses = np.ones(count, np.int64), np.zeros(count, np.int64)
@@ -341,7 +341,7 @@ class KalmanTracker:
         selected = self.tracks.take(
             (self.tracks.hits >= self.settings.confirm) & np.isfinite(scene_times[self.tracks.scene])
         )
-        return selected.at(scene_times[selected.scene], self.settings.density).reported()
+        return selected.predict_to(scene_times[selected.scene], self.settings.density).to_tracks()
 
 
 def kalman_tracker(  # plain values, as they stand in a suite
@@ -356,13 +356,13 @@ def kalman_tracker(  # plain values, as they stand in a suite
     density: float = 3.0,
     speed: float = 6.0,
 ) -> KalmanTracker:
-    """Return the built-in tracker; its arguments are the fields of `Tracking`.
+    """Return the built-in tracker; its arguments are the fields of `TrackerSettings`.
 
     Raises:
         ConfigError: A setting is out of its range.
     """
     return KalmanTracker(
-        Tracking(
+        TrackerSettings(
             confirm=confirm,
             reserve=reserve,
             patience=patience,

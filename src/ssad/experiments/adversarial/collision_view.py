@@ -7,7 +7,7 @@ import numpy as np
 
 from ssad.core.geometry import corners
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.lane_strips import strips
+from ssad.core.lane_strips import make_lane_strips
 from ssad.core.types import F64, U8, EpisodeTrace
 
 GROUND, ROAD, SIDEWALK, MARKING = (236, 240, 238), (196, 199, 203), (221, 222, 224), (255, 255, 255)
@@ -17,7 +17,7 @@ SHOWN_SECONDS = 6.0  # s of the motion that is shown
 MARGIN = 14.0  # m
 
 
-def found_view(
+def draw_collision(
     trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *, size: int = 420, last_step: int | None = None
 ) -> U8:
     """Draw a scenario from above: paths of the last seconds, bodies each second faint, and at the end in full.
@@ -51,11 +51,11 @@ def found_view(
     canvas = np.full((size, size, 3), GROUND, np.uint8)
     visible_strips = [  # a straight strip may have no corner in the picture
         strip
-        for strip in strips(graph)
-        if (strip.ring.min(0) < centre + half_width).all() and (strip.ring.max(0) > centre - half_width).all()
+        for strip in make_lane_strips(graph)
+        if (strip.outline.min(0) < centre + half_width).all() and (strip.outline.max(0) > centre - half_width).all()
     ]
     for strip in visible_strips:
-        cv2.fillPoly(canvas, [to_pixels(strip.ring)], ROAD if strip.layer >= 2 else SIDEWALK, cv2.LINE_AA, 4)
+        cv2.fillPoly(canvas, [to_pixels(strip.outline)], ROAD if strip.layer >= 2 else SIDEWALK, cv2.LINE_AA, 4)
     for strip in visible_strips:
         if strip.layer == 3 and not strip.junction:
             for edge in (strip.left, strip.right):

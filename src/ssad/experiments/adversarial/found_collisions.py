@@ -12,7 +12,7 @@ import numpy as np
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.core.types import Episode, Scenario
-from ssad.experiments.adversarial.search_scores import MOVING, distinct
+from ssad.experiments.adversarial.search_scores import MOVING, distinct_collisions
 
 AVOIDERS = {
     "cc": "CC",
@@ -24,7 +24,7 @@ AVOIDERS = {
 """Short name in a grade -> who avoids a collision: the careful drivers, and the kinematic limit."""
 
 
-def collides(base: Base) -> bool:
+def has_collision(base: Base) -> bool:
     """Return True if a drive ends in a collision."""
     return bool(base.trace.end == "collision")
 
@@ -47,7 +47,7 @@ def saved_collisions(
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
-    collisions = distinct([outcome for outcome in row if outcome.valid])[:limit]
+    collisions = distinct_collisions([outcome for outcome in row if outcome.is_valid])[:limit]
     scenarios = [scenario_of(outcome, base, name=f"{stem}-{index}") for index, outcome in enumerate(collisions)]
     if scenarios:
         save_scenarios(path, scenarios)
@@ -64,13 +64,13 @@ def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> d
     if not rows:
         return {}
     is_avoidable = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
-    avoidable_moving = [avoidable for avoidable, base in zip(is_avoidable, collisions, strict=True) if _moves(base)]
+    avoidable_moving = [avoidable for avoidable, base in zip(is_avoidable, collisions, strict=True) if _ego_moves(base)]
     shares_by_model = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     shares_by_model["attributable"] = float(np.mean(is_avoidable))
     return shares_by_model | ({"attributable_moving": float(np.mean(avoidable_moving))} if avoidable_moving else {})
 
 
-def _moves(base: Base) -> bool:
+def _ego_moves(base: Base) -> bool:
     """Return True if the ego moves when it is hit."""
     return abs(float(base.trace.speed[int(np.flatnonzero(base.trace.contact)[0]), 0])) > MOVING
 
@@ -109,12 +109,12 @@ def transfer(
         # All episodes of a system run as one batch; the iterator hands them back group by group.
         driven_bases = iter(trials.bases([episode_spec for episodes in episode_groups for episode_spec in episodes]))
         for system_rates, episodes in zip(rows, episode_groups, strict=True):
-            collision_flags = [float(collides(next(driven_bases))) for _ in episodes]
+            collision_flags = [float(has_collision(next(driven_bases))) for _ in episodes]
             system_rates[name] = {"base": collision_flags[0], "found": float(np.mean(collision_flags[1:]))}
     return rows
 
 
-def refusal(factory: Any, episode: Episode) -> str:
+def refusal_reason(factory: Any, episode: Episode) -> str:
     """Return the reason why a generator cannot change an episode; "" if it can."""
     check = getattr(factory, "check", None)
     try:

@@ -16,7 +16,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.core.registry import label_of
 from ssad.core.run_records import COUNT, NOT_NEGATIVE, SHARE
-from ssad.core.safeio import plain
+from ssad.core.safeio import to_plain_json
 from ssad.core.source import source_version
 from ssad.core.traces import motion_hash, save_trace
 from ssad.core.types import Scenario
@@ -24,15 +24,15 @@ from ssad.engine.kind import Cell, Column, Job, Names, Plan, Resources, check_di
 from ssad.experiments.adversarial import page
 from ssad.experiments.adversarial.found_collisions import (
     AVOIDERS,
-    collides,
     grades,
-    refusal,
+    has_collision,
+    refusal_reason,
     saved_collisions,
     transfer,
 )
-from ssad.experiments.adversarial.search_scores import likeness, reference, summary
+from ssad.experiments.adversarial.search_scores import load_reference_motions, realism_scores, summary
 from ssad.experiments.adversarial.verdict import verdict
-from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, described
+from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, describe_scenarios
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.simulators.closed_loop import cached_town, grades_of, system_version
@@ -113,13 +113,13 @@ class Adversarial(ScenarioKind):
         systems = {name: system_version(name) for name in dict.fromkeys([*suite.systems, *suite.transfer])}
         factories = {name: generator_factory(name) for name in suite.generators}
         generators = {name: source_version(factory.__module__) for name, factory in factories.items()}
-        scenarios, towns = described(suite)
+        scenarios, towns = describe_scenarios(suite)
         if check:
             episodes = [
                 build_episode(scenario.scenario, cached_town(scenario.scenario.town), seed=0) for scenario in scenarios
             ]
             for name, factory in factories.items():
-                refusals = [refusal(factory, episode) for episode in episodes]
+                refusals = [refusal_reason(factory, episode) for episode in episodes]
                 if all(refusals):
                     raise ConfigError(f"generator {name}: {refusals[0]}")
         transfer_versions = [systems[name] for name in suite.transfer]
@@ -179,12 +179,12 @@ class Adversarial(ScenarioKind):
         results: dict[str, dict[str, Any]] = {}
         for cell in cells:
             base = bases[cell.key]
-            refusal_reason, is_survived = refusal(factory, base.episode), not collides(base)
-            if is_survived and not refusal_reason:
+            refusal, is_survived = refusal_reason(factory, base.episode), not has_collision(base)
+            if is_survived and not refusal:
                 surviving_cells.append(cell)
                 continue
-            metrics: dict[str, Any] = {"applies": not refusal_reason, "survived": is_survived}
-            results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refusal_reason}
+            metrics: dict[str, Any] = {"applies": not refusal, "survived": is_survived}
+            results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refusal}
         if not surviving_cells:
             return results
         start_time = time.process_time()
@@ -197,9 +197,11 @@ class Adversarial(ScenarioKind):
             trials,
             budget=spec["budget"],
             batch=spec["batch"],
-            after=lambda rollout_count: time_by_rollouts.update({rollout_count: time.process_time() - start_time}),
+            on_batch_end=lambda rollout_count: time_by_rollouts.update(
+                {rollout_count: time.process_time() - start_time}
+            ),
         )
-        reference_motion = reference(job.folder, job.device)
+        reference_motion = load_reference_motions(job.folder, job.device)
         saved = [
             self._save(cell, base, trial_outcomes, job.folder)
             for cell, base, trial_outcomes in zip(surviving_cells, surviving_bases, outcomes, strict=True)
@@ -211,7 +213,7 @@ class Adversarial(ScenarioKind):
             surviving_cells, surviving_bases, outcomes, saved, replays, strict=True
         ):
             metrics = {"applies": True, "survived": True, **summary(trial_outcomes), **replay_record.pop("metrics")}
-            metrics |= likeness(trial_outcomes, base.graph, reference_motion)
+            metrics |= realism_scores(trial_outcomes, base.graph, reference_motion)
             # All bases are searched side by side: each takes an equal part of the time.
             metrics["seconds"] = max(time_by_rollouts.values()) / len(surviving_cells)
             times_to_collision = [
@@ -223,7 +225,7 @@ class Adversarial(ScenarioKind):
             results[cell.key] = {
                 **artefacts,
                 **replay_record,
-                "metrics": plain(metrics),
+                "metrics": to_plain_json(metrics),
                 "case": cell.key,
                 "n": len(trial_outcomes),
             }
@@ -270,7 +272,7 @@ class Adversarial(ScenarioKind):
             seeds=seeds,
         )
         collisions = [
-            [base for base in (next(replayed_bases) for _ in scenarios_by_base[cell_index]) if collides(base)]
+            [base for base in (next(replayed_bases) for _ in scenarios_by_base[cell_index]) if has_collision(base)]
             for cell_index in cell_indices
         ]
         is_graded = cells[0].spec["grade"]

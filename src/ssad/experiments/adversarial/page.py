@@ -14,7 +14,7 @@ import cv2
 from ssad.core.errors import SSADError
 from ssad.core.lane_graph import load_graph, town_file
 from ssad.core.traces import load_trace
-from ssad.experiments.adversarial.collision_view import found_view
+from ssad.experiments.adversarial.collision_view import draw_collision
 from ssad.metrics import CaseValue, estimate
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.uncertainty import Kind, paired_difference
@@ -53,7 +53,7 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
         ([str(line["generator"]), str(line["system"]), scenario_of(line)], line["status"], line["reason"])
         for line in run.failures
     ]
-    return render(TEMPLATE, run, verdict=verdict, tables=tables, failures=failures, views=views(run)), tables
+    return render(TEMPLATE, run, verdict=verdict, tables=tables, failures=failures, views=collision_views(run)), tables
 
 
 def summary(run: Run) -> Table:
@@ -100,7 +100,7 @@ def transfer_table(run: Run) -> Table | None:
 
     def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         with_adversary, base = (
-            {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line, system in drives}
+            {str(line["key"]): _case_value(line, float(line["transfer"][system][condition])) for line, system in drives}
             for condition in ("found", "base")
         )
         if column == "difference":
@@ -136,7 +136,7 @@ def budget_table(run: Run) -> Table:
         run.lines,
         rows=SEARCH,
         columns={count: f"CR within {count}" for count in rollout_limits},
-        metric=lambda lines, count: _mean(lines, partial(_within, max_rollouts=count), "share"),
+        metric=lambda lines, count: _mean(lines, partial(_has_found_within, max_rollouts=count), "share"),
         note=METHODS,
     )
 
@@ -148,9 +148,9 @@ def against_table(run: Run) -> Table | None:
     def metric(lines: Sequence[Line], _: str) -> TableCell:
         generator_cases, random_cases = (
             {
-                f"{scenario_of(line)}#{line['spec']['repetition']}": _case(line, _within(line))
+                f"{scenario_of(line)}#{line['spec']['repetition']}": _case_value(line, _has_found_within(line))
                 for line in search_lines
-                if line["status"] != "ok" or not math.isnan(_within(line))
+                if line["status"] != "ok" or not math.isnan(_has_found_within(line))
             }
             for search_lines in (lines, random_lines[str(lines[0]["system"])])
         )
@@ -177,7 +177,9 @@ def group_table(run: Run) -> Table:
         run.lines,
         rows=SEARCH,
         columns={line["group"]: str(line["group"]) for line in run.lines},
-        metric=lambda lines, group: _mean([line for line in lines if line["group"] == group], _within, "share"),
+        metric=lambda lines, group: _mean(
+            [line for line in lines if line["group"] == group], _has_found_within, "share"
+        ),
         note=METHODS,
     )
 
@@ -194,9 +196,9 @@ def traffic_table(run: Run) -> Table | None:
 
     def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         collided = {str(line["key"]): 1.0 - metric_of(line, "survived") for line, _ in drives}
-        natural_cases = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
+        natural_cases = {str(line["key"]): _case_value(line, collided[str(line["key"])]) for line, _ in drives}
         adversarial = {
-            str(line["key"]): _case(line, max(collided[str(line["key"])], _has_found(line))) for line, _ in drives
+            str(line["key"]): _case_value(line, max(collided[str(line["key"])], _has_found(line))) for line, _ in drives
         }
         among_adversaries = drives[0][1] == "Adv.PPO"
         if column == "CR":
@@ -241,7 +243,7 @@ def _has_found(line: Line) -> float:
     return float(bool((line["metrics"] or {}).get("CR_any")))
 
 
-def views(run: Run) -> list[dict[str, str]]:
+def collision_views(run: Run) -> list[dict[str, str]]:
     """Return collisions from above, one of each generator and group in turn: data URI, caption, command."""
     lines_by_group: dict[tuple[str, str, str], Line] = {}
     for line in run.lines:
@@ -254,7 +256,7 @@ def views(run: Run) -> list[dict[str, str]]:
             graph = load_graph(run.folder / "towns" / town_file(trace.town))
         except SSADError:
             continue  # named on the page as missing or damaged
-        image = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
+        image = draw_collision(trace, graph, [int(agent) for agent in line["adversaries"]])
         encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         caption = f"{generator} against {system} in {scenario_of(line)}"
         command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
@@ -276,7 +278,7 @@ def _by_search(run: Run) -> list[Line]:
     return [line for lines in _searches(run).values() for line in lines]
 
 
-def _within(line: Line, max_rollouts: float = math.inf) -> float:
+def _has_found_within(line: Line, max_rollouts: float = math.inf) -> float:
     """Return 1 if a search has found a collision within so many rollouts, else 0; NaN without a search."""
     metrics = line.get("metrics") or {}
     if line["status"] != "ok" or metrics.get("CR") is None:
@@ -286,9 +288,9 @@ def _within(line: Line, max_rollouts: float = math.inf) -> float:
 
 def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> TableCell:
     """Return the mean of a value of searches, over their base scenarios."""
-    return TableCell.of(estimate([_case(line, value(line)) for line in lines], kind, min_clusters=MIN_ROUTES))
+    return TableCell.of(estimate([_case_value(line, value(line)) for line in lines], kind, min_clusters=MIN_ROUTES))
 
 
-def _case(line: Line, value: float) -> CaseValue:
+def _case_value(line: Line, value: float) -> CaseValue:
     """Return a search as a case of its base scenario."""
     return CaseValue(value, str(line["cluster"]), str(line["key"]), failed=line["status"] != "ok")

@@ -16,7 +16,7 @@ from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.realism import motion_features, pooled, realism, wasserstein
+from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein
 from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
 
@@ -30,20 +30,20 @@ REPORTED_FEATURES: Final = ("speed", "acceleration", "yaw_rate", "nearest")
 
 def summary(row: Sequence[Outcome]) -> dict[str, Any]:
     """The metrics of one search; means over collisions are None where there is none."""
-    valid = [outcome for outcome in row if outcome.valid]
+    valid = [outcome for outcome in row if outcome.is_valid]
     completed = [outcome for outcome in row if outcome.trace is not None]
-    first_rollout = next((rollout for rollout, outcome in enumerate(row, 1) if outcome.valid), None)
+    first_rollout = next((rollout for rollout, outcome in enumerate(row, 1) if outcome.is_valid), None)
 
     def mean(values: Sequence[float | bool | None]) -> float | None:
-        measured = [float(value) for value in values if value is not None]
-        return float(np.mean(measured)) if measured else None
+        measured_values = [float(value) for value in values if value is not None]
+        return float(np.mean(measured_values)) if measured_values else None
 
     return {
         "CR": bool(valid),
         "CR_any": any(outcome.collision for outcome in row),
         "rollouts": first_rollout,
-        "share": mean([outcome.valid for outcome in row]),
-        "distinct": len(distinct(valid)),
+        "share": mean([outcome.is_valid for outcome in row]),
+        "distinct": len(distinct_collisions(valid)),
         "off_road": mean([outcome.off_road for outcome in completed]),
         "hit_others": mean([outcome.hit_others for outcome in completed]),
         "moving": mean([outcome.ego_speed is not None and outcome.ego_speed > MOVING for outcome in valid]),
@@ -54,14 +54,14 @@ def summary(row: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
+def distinct_collisions(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """Return the distinct ones among some collisions, by the motion of the struck agent as the ego sees it.
 
     Motions are compared over the 3 s before contact; a mean difference below 1 m is the same collision.
     """
     distinct_approaches: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
     for outcome in outcomes:
-        motion = _approach(outcome)
+        motion = _approach_positions(outcome)
         if all(
             float(np.hypot(*(motion - other_motion).T).mean()) >= MIN_DIFFERENCE
             for _, other_motion in distinct_approaches
@@ -70,7 +70,7 @@ def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return [outcome for outcome, _ in distinct_approaches]
 
 
-def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
+def _approach_positions(outcome: Outcome) -> np.ndarray[Any, Any]:
     """Return the positions of the struck agent in the ego's frame [30, 2], m, in the steps before contact."""
     trace = outcome.trace
     assert trace is not None
@@ -98,10 +98,16 @@ def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> lis
     return features
 
 
-def likeness(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mapping[str, F64]) -> dict[str, float]:
+def realism_scores(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mapping[str, F64]) -> dict[str, float]:
     """Realism score and distances of the adversaries that have collided with the ego; NaN if none has."""
-    collided = [outcome for outcome in row if outcome.valid and outcome.trace is not None]
-    features = pooled([motion for outcome in collided for motion in motions(outcome.trace, graph, outcome.adversaries)])  # type: ignore[arg-type]
+    features = pool_motions(
+        [
+            motion
+            for outcome in row
+            if outcome.is_valid and outcome.trace is not None
+            for motion in motions(outcome.trace, graph, outcome.adversaries)
+        ]
+    )
     feature_distances = wasserstein(features, reference_motions)
     return {
         "realism": realism(features, reference_motions),
@@ -109,16 +115,16 @@ def likeness(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mappin
     }
 
 
-def reference(folder: Path, device: str) -> dict[str, F64]:
+def load_reference_motions(folder: Path, device: str) -> dict[str, F64]:
     """The features of the vehicles in natural scenarios driven by the Autopilot; made once for a results folder."""
     path = folder / "reference.npz"
     if not path.exists():
-        safeio.save_npz(path, _natural(device))
+        safeio.save_npz(path, _natural_motions(device))
     return {name: np.asarray(values, np.float64) for name, values in safeio.load_npz(path).items()}
 
 
 @lru_cache(maxsize=1)
-def _natural(device: str) -> dict[str, F64]:
+def _natural_motions(device: str) -> dict[str, F64]:
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic import load_scenarios
     from ssad.scenarios.dynamic.generate import Trials
@@ -130,4 +136,4 @@ def _natural(device: str) -> dict[str, F64]:
     features = []
     for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in selected]):
         features += motions(base.trace, base.graph, range(1, len(base.trace.names)))
-    return pooled(features)
+    return pool_motions(features)

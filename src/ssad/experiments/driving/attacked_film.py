@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ssad.core.frames import Camera
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.protocols import Detector
 from ssad.core.types import U8, AgentKind, EpisodeTrace
@@ -20,7 +20,7 @@ from ssad.rendering.onboard import DAY, Onboard
 FILMING_RANGE = 40.0  # m ahead of the ego within which an agent is worth filming
 
 
-def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | None:
+def agent_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | None:
     """The agent of a kind that is longest before the ego, within `NEAR` m and in its camera's view; None if none is."""
     dx, dy = trace.x - trace.x[:, :1], trace.y - trace.y[:, :1]
     cos, sin = np.cos(trace.yaw[:, :1]), np.sin(trace.yaw[:, :1])
@@ -73,5 +73,5 @@ def attacked_frames(
                 image = draw_clear_detections(
                     detector, torch.from_numpy(rendered.copy())[None].float() / 255, intrinsic
                 )
-            tiles.append(captioned(image, f"{title}, {step * trace.dt:.1f} s", width))
+            tiles.append(add_caption(image, f"{title}, {step * trace.dt:.1f} s", width))
         yield np.hstack(tiles)

@@ -10,7 +10,7 @@ from itertools import product
 
 from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
-from ssad.metrics.driving import DIVISORS, normalised
+from ssad.metrics.driving import DIVISORS, normalise_metric
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS, SOURCE
 from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
@@ -81,8 +81,8 @@ def _counts(run: DrivingRun, systems: list[str]) -> str:
     for system in systems:
         cells = [estimates["CR"] for group in SCENARIOS if (estimates := run.numbers.get((system, group)))]
         ranges = [
-            str(fewest) if fewest == largest else f"{fewest} to {largest}"
-            for fewest, largest in (
+            str(min_count) if min_count == largest else f"{min_count} to {largest}"
+            for min_count, largest in (
                 (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
             )
         ]
@@ -134,14 +134,14 @@ def _town_weights(run: DrivingRun, towns: Mapping[str, str]) -> str:
 def full_table(run: DrivingRun) -> Table:
     """Return every metric for every system and group."""
     note = f"{average_note(run)} {METHODS}"
-    if not run.measures("SS"):
+    if not run.is_measured("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
     return Table.listing(
         "metrics",
         "All metrics",
         run.numbers,
         rows={"System": lambda key: key[0], "Group": lambda key: run.headings[key[1]]},
-        columns={symbol: symbol for symbol in METRICS if symbol != "LC" or run.measures(symbol)},
+        columns={symbol: symbol for symbol in METRICS if symbol != "LC" or run.is_measured(symbol)},
         metric=partial(_cell, run),
         note=note,
     )
@@ -153,7 +153,7 @@ def normalised_table(run: DrivingRun) -> Table:
     def metric(key: tuple[str, str], column: str) -> TableCell:
         estimate = run.numbers[key]["OS" if column == "FREA" else column]
         if column in ("OR", "DR", "TS"):
-            return TableCell.of(_scaled(column, estimate))
+            return TableCell.of(_normalise(column, estimate))
         return TableCell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
 
     return Table.listing(
@@ -175,10 +175,10 @@ def normalised_table(run: DrivingRun) -> Table:
     )
 
 
-def _scaled(name: str, estimate: Estimate) -> Estimate:
+def _normalise(name: str, estimate: Estimate) -> Estimate:
     """Return a raw metric over its divisor, cut at 1."""
     scaled_values = (
-        value if math.isnan(value) else normalised(name, value)
+        value if math.isnan(value) else normalise_metric(name, value)
         for value in (estimate.mean, estimate.low, estimate.high)
     )
     mean, lower, upper = scaled_values

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.lane_strips import LAYERS, junction_areas, strips, thin
+from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips, simplify_polyline
 from ssad.core.types import EpisodeTrace, LaneType
 
 SCALE = 0.03  # m
@@ -25,13 +25,13 @@ SHARE = 1000.0  # throttle, brake, steer, completion as thousandths
 NEAR = 80.0  # m around the episodes in which lanes are kept
 
 
-def pack(columns: npt.NDArray[np.int16]) -> str:
+def encode_int16(columns: npt.NDArray[np.int16]) -> str:
     """Encode int16 [C, T] as text: differences along T, little-endian, zlib, base64."""
     differences = np.diff(columns.astype(np.int32), axis=1, prepend=0)
     return base64.b64encode(zlib.compress(differences.astype("<i2").tobytes(), 9)).decode()
 
 
-def _i16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
+def _to_int16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
     return np.clip(np.round(values), -32767, 32767).astype(np.int16)
 
 
@@ -69,7 +69,7 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         trace.brake * SHARE,
         trace.steer * SHARE,
         trace.route_complete * 10.0,
-        _gap(trace) / SPEED,
+        _distance_to_nearest(trace) / SPEED,
         trace.off_road.astype(np.float64),
     ]
     contacts = [[int(step), int(trace.contact_agent[step])] for step in np.flatnonzero(trace.contact)]
@@ -79,17 +79,21 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         "names": list(trace.names),
         "kinds": trace.kind.tolist(),
         "size": np.round(np.stack([trace.length, trace.width], 1), 2).tolist(),
-        "motion": pack(np.stack([_i16(np.asarray(row)) for row in [*rows, *presence]])),
-        "record": pack(np.stack([_i16(row) for row in record])),
-        "route": pack(_i16((thin(trace.route.astype(np.float64)) - [origin_x, origin_y]) / SCALE).T),
+        "motion": encode_int16(np.stack([_to_int16(np.asarray(row)) for row in [*rows, *presence]])),
+        "record": encode_int16(np.stack([_to_int16(row) for row in record])),
+        "route": encode_int16(
+            _to_int16((simplify_polyline(trace.route.astype(np.float64)) - [origin_x, origin_y]) / SCALE).T
+        ),
         "hits": contacts,
         "red": np.flatnonzero(trace.red_light).tolist(),
-        "signals": [_changes(trace.signal[:, column], int(signal)) for column, signal in enumerate(trace.signal_ids)],
+        "signals": [
+            _state_changes(trace.signal[:, column], int(signal)) for column, signal in enumerate(trace.signal_ids)
+        ],
         "end": trace.end,
     }
 
 
-def _gap(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
+def _distance_to_nearest(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
     """Rough free distance to the nearest other agent, m (centres less half lengths): for the read-out only."""
     if len(trace.names) < 2:
         return np.full(len(trace.accel), 300.0)
@@ -100,7 +104,7 @@ def _gap(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
     return clipped
 
 
-def _changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
+def _state_changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
     """Return [signal, [[step, state], ...]]: only where the state changes."""
     change_steps = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
     return [index, [[int(step), int(states[step])] for step in change_steps]]
@@ -114,18 +118,18 @@ def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any
     near_cells = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
     origin_x, origin_y = origin(graph)
     shapes: list[list[Any]] = []
-    lanes = strips(graph)
+    lanes = make_lane_strips(graph)
     for area in junction_areas(graph, lanes):
         if any(tuple(cell) in near_cells for cell in np.floor(area / NEAR).astype(int)):
-            shapes.append([LAYERS[LaneType.DRIVING], 1, [0, 0], len(area), _flat(area, origin_x, origin_y)])
+            shapes.append([LAYERS[LaneType.DRIVING], 1, [0, 0], len(area), _flatten(area, origin_x, origin_y)])
     for strip in lanes:
         end_centres = 0.5 * (strip.left[[0, -1]] + strip.right[[0, -1]])
         # A long straight strip may have no corner near the route: its ends are tested by their centres too.
-        test_points = np.concatenate([strip.ring, end_centres])
+        test_points = np.concatenate([strip.outline, end_centres])
         if any(tuple(cell) in near_cells for cell in np.floor(test_points / NEAR).astype(int)):
-            lines = _lines(graph, strip.lane)
+            lines = _line_codes(graph, strip.lane)
             shapes.append(
-                [strip.layer, int(strip.junction), lines, len(strip.left), _flat(strip.ring, origin_x, origin_y)]
+                [strip.layer, int(strip.junction), lines, len(strip.left), _flatten(strip.outline, origin_x, origin_y)]
             )
     signals = [[round(float(x) - origin_x, 2), round(float(y) - origin_y, 2)] for x, y in graph.signal_xy]
     return {
@@ -136,7 +140,7 @@ def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any
     }
 
 
-def _lines(graph: LaneGraph, lane: int) -> list[int]:
+def _line_codes(graph: LaneGraph, lane: int) -> list[int]:
     """Return line codes of the left and right edge: 0 none, 1 broken, 2 solid, 3 double (between opposing lanes)."""
     line_codes = []
     for side in (graph.left, graph.right):
@@ -152,13 +156,13 @@ def _lines(graph: LaneGraph, lane: int) -> list[int]:
     return line_codes
 
 
-def _flat(xy: npt.NDArray[np.float64], origin_x: float, origin_y: float) -> list[float]:
+def _flatten(xy: npt.NDArray[np.float64], origin_x: float, origin_y: float) -> list[float]:
     return [round(float(value), 2) for value in (xy - [origin_x, origin_y]).reshape(-1)]
 
 
 def _crosswalks(graph: LaneGraph, origin_x: float, origin_y: float) -> list[list[float]]:
     offsets: Sequence[int] = graph.crosswalk_offset.tolist()
     return [
-        _flat(graph.crosswalk_xy[start:end].astype(np.float64), origin_x, origin_y)
+        _flatten(graph.crosswalk_xy[start:end].astype(np.float64), origin_x, origin_y)
         for start, end in itertools.pairwise(offsets)
     ]

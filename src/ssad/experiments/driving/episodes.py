@@ -82,17 +82,17 @@ class DrivingRun:
         ]
         return self.numbers.get((system, FAMILIES[family])) or (self.numbers[system, groups[0]] if groups else None)
 
-    def measures(self, symbol: str) -> bool:
+    def is_measured(self, symbol: str) -> bool:
         """Return whether any episode measured a metric."""
         return any(values[symbol].n for values in self.numbers.values())
 
 
 def load_episodes(run: Run) -> DrivingRun:
     """Return the episodes of a driving run."""
-    return DrivingRun(run, tuple(_record(line, run.episodes.get(line["key"], {})) for line in run.lines))
+    return DrivingRun(run, tuple(_make_record(line, run.episodes.get(line["key"], {})) for line in run.lines))
 
 
-def _record(line: Mapping[str, Any], episode: Mapping[str, Any]) -> EpisodeRecord:
+def _make_record(line: Mapping[str, Any], episode: Mapping[str, Any]) -> EpisodeRecord:
     scenario = line["spec"]["scenario"]
     succeeded = line["status"] == "ok"
     return EpisodeRecord(

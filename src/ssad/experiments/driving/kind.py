@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from ssad.core.errors import ConfigError, SSADError
-from ssad.core.safeio import plain
+from ssad.core.safeio import to_plain_json
 from ssad.core.types import EpisodeTrace
 from ssad.engine.kind import Cell, Column, Job, Names, Plan, Resources, check_distinct
 from ssad.experiments.driving import page
@@ -18,7 +18,7 @@ from ssad.experiments.driving.verdict import verdict
 from ssad.experiments.scenario_kind import (
     ScenarioKind,
     ScenarioSuite,
-    described,
+    describe_scenarios,
     drive_record,
 )
 from ssad.metrics import METRICS
@@ -28,8 +28,8 @@ from ssad.report.tables import Table
 from ssad.simulators.closed_loop import (
     EMBEDDED,
     HIGHWAY_TYPE,
+    build_requested_episode,
     drive,
-    episode_of,
     grade_of,
     is_carla,
     runs_embedded,
@@ -81,7 +81,7 @@ class Driving(ScenarioKind):
         """Look up systems, scenarios and towns; with `check`, build each scenario once."""
         check_distinct(suite, "systems", suite.systems)
         systems = {name: system_version(name) for name in suite.systems}
-        scenarios, towns = described(suite)
+        scenarios, towns = describe_scenarios(suite)
         simulator_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
         inputs = []
         if simulator_spec and any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):
@@ -140,19 +140,19 @@ class Driving(ScenarioKind):
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drive the episodes as one batch of the world, measure them, write their traces."""
         start_time = time.perf_counter()
-        episodes, traces, measured = drive(cells, device=job.device)
+        episodes, traces, simulator_counts = drive(cells, device=job.device)
         shared_seconds = (time.perf_counter() - start_time) / len(cells)
         results: dict[str, dict[str, Any]] = {}
         for cell, episode, trace in zip(cells, episodes, traces, strict=True):
             start_time = time.perf_counter()
             result = drive_record(cell, episode, trace, job.folder)
-            if measured:
-                result["metrics"]["lane_crossings"] = measured["lane_crossings"]
-                result["measured"] = plain(measured)
+            if simulator_counts:
+                result["metrics"]["lane_crossings"] = simulator_counts["lane_crossings"]
+                result["measured"] = to_plain_json(simulator_counts)
             if job.settings["witness"] and trace.end == "collision" and runs_embedded(cell):
                 grade = grade_of(episode, trace, job.device)
                 result["metrics"] |= grade.metrics()
-                result["witness"] = plain(grade.as_dict())
+                result["witness"] = to_plain_json(grade.as_dict())
             results[cell.key] = result | {"wall_s": shared_seconds + time.perf_counter() - start_time}
         return results
 
@@ -182,7 +182,7 @@ class Driving(ScenarioKind):
 
 def _check(cell: Cell) -> None:
     try:
-        episode_of(cell)
+        build_requested_episode(cell)
     except SSADError as error:
         name = f"scenario {cell.spec['scenario']['name']}"
         raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None

@@ -36,32 +36,32 @@ def summary(run: Run) -> Table:
     return summary_table(load_episodes(run))
 
 
-def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a driving run and its tables."""
-    run = load_episodes(found)
+    run = load_episodes(stored_run)
     tables = driving_tables(run)
     tables_by_name = {table.name: table for table in tables}
     replay = replay_data(run)
-    gallery = _pictures(found)
+    gallery = _pictures(stored_run)
     if gallery:
         safeio.write_atomic(
-            found.folder / "gallery.html", render(TEMPLATE.with_name("gallery.html"), found, pictures=gallery)
+            stored_run.folder / "gallery.html", render(TEMPLATE.with_name("gallery.html"), stored_run, pictures=gallery)
         )
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=verdict,
-        tiles=[_tile(run, system) for system in run.systems],
+        tiles=[_system_tile(run, system) for system in run.systems],
         precrash=tables_by_name.get("precrash"),
         natural=tables_by_name.get("natural"),
         full=tables_by_name["metrics"],
         normalised=tables_by_name["normalised"],
         plot=interval_plot(_collision_rates(run), label="collision rate with 95 % intervals"),
-        matrix=_matrix(run),
+        matrix=_outcome_matrix(run),
         failures=[record for record in run.records if record.status != "ok"],
-        witness=_witness(run),
+        witness=_avoidability(run),
         metrics={name: metric for name, metric in METRICS.items() if name in tables_by_name["metrics"].columns},
-        stop_signs=run.measures("SS"),
+        stop_signs=run.is_measured("SS"),
         # "</" would end the script element that holds the data
         replay=safeio.dump_json(replay).replace("</", "<\\/"),
         missing=replay["missing"],
@@ -81,7 +81,7 @@ def _pictures(run: Run) -> list[dict[str, Any]]:
     return groups
 
 
-def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
+def _system_tile(run: DrivingRun, system: str) -> dict[str, Any]:
     """Return the headline numbers of one system: those of the tables' averages."""
     parts = []
     for family, title in FAMILY_TITLES.items():
@@ -127,7 +127,7 @@ def _collision_rates(run: DrivingRun) -> list[tuple[str, list[Interval]]]:
     ]
 
 
-def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
+def _outcome_matrix(run: DrivingRun) -> list[dict[str, Any]]:
     """Return groups of episodes, one row per system."""
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
     for record in run.records:
@@ -137,7 +137,7 @@ def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
     return [{"group": name, "systems": systems} for name, systems in groups.items()]
 
 
-def _witness(run: DrivingRun) -> dict[str, Any] | None:
+def _avoidability(run: DrivingRun) -> dict[str, Any] | None:
     """For each system and group: of how many collisions, how many each careful driver avoids, and anybody."""
     rows: dict[tuple[str, str], Counter[str]] = {}
     for record in run.records:

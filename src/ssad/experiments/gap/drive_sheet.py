@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from ssad.core.geometry import to_local
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.perception import Perceived
+from ssad.core.perception import DrivePerception
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.metrics.perception_in_drive import in_view
 
@@ -29,7 +29,9 @@ GROUND, LANE, VISIBLE, HIDDEN, DETECTED, BELIEVED, EGO = (
 LEGEND = "grey: there (dark: out of view), orange: found, blue: believed"
 
 
-def drive_sheet(trace: EpisodeTrace, perceived: Perceived, shots: Sequence[tuple[float, U8]], graph: LaneGraph) -> U8:
+def drive_sheet(
+    trace: EpisodeTrace, perceived: DrivePerception, shots: Sequence[tuple[float, U8]], graph: LaneGraph
+) -> U8:
     """A row for each of three moments: 2 and 1 s before the first contact and at it, or spread over the drive.
 
     Args:
@@ -44,7 +46,7 @@ def drive_sheet(trace: EpisodeTrace, perceived: Perceived, shots: Sequence[tuple
         if len(contact_steps)
         else [end_time * quarter / 4 for quarter in (1, 2, 3)]
     )
-    return np.vstack([_row(RecordedDrive("", trace, perceived, shots), time, graph) for time in row_times])
+    return np.vstack([_draw_moment(RecordedDrive("", trace, perceived, shots), time, graph) for time in row_times])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class RecordedDrive:
 
     title: str
     trace: EpisodeTrace
-    perceived: Perceived
+    perceived: DrivePerception
     shots: Sequence[tuple[float, U8]]
 
     @property
@@ -83,11 +85,14 @@ def drive_film(drives: Sequence[RecordedDrive], graph: LaneGraph, *, frame_inter
     end_time = max(drive.end for drive in drives)
     for frame_index in range(int(end_time / frame_interval + 1.5)):
         yield np.hstack(
-            [_row(drive, min(frame_index * frame_interval, drive.end), graph, at_exact_step=True) for drive in drives]
+            [
+                _draw_moment(drive, min(frame_index * frame_interval, drive.end), graph, at_exact_step=True)
+                for drive in drives
+            ]
         )
 
 
-def _row(drive: RecordedDrive, time: float, graph: LaneGraph, *, at_exact_step: bool = False) -> U8:
+def _draw_moment(drive: RecordedDrive, time: float, graph: LaneGraph, *, at_exact_step: bool = False) -> U8:
     """Draw a moment of a drive; unless `at_exact_step`, all of it is shown at the time of the nearest image."""
     trace, perceived = drive.trace, drive.perceived
     shown_time, image = min(drive.shots, key=lambda timed_image: abs(timed_image[0] - time))
@@ -96,15 +101,15 @@ def _row(drive: RecordedDrive, time: float, graph: LaneGraph, *, at_exact_step: 
     image_width = image.shape[1] * VIEW_HEIGHT // image.shape[0]
     resized = cv2.resize(np.ascontiguousarray(image), (image_width, VIEW_HEIGHT), interpolation=cv2.INTER_AREA)
     text = f"{drive.title}{', ' if drive.title else ''}{shown_time:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-    camera_panel = captioned(
-        np.asarray(_marked_image(resized, trace, step, shown_time, perceived), np.uint8), text, image_width
+    camera_panel = add_caption(
+        np.asarray(_mark_objects(resized, trace, step, shown_time, perceived), np.uint8), text, image_width
     )
-    top_panel = captioned(_top_view(trace, step, shown_time, perceived, graph), LEGEND, WIDTH)
+    top_panel = add_caption(_top_view(trace, step, shown_time, perceived, graph), LEGEND, WIDTH)
     row_height = max(len(camera_panel), len(top_panel))
-    return np.hstack([_padded(camera_panel, row_height), _padded(top_panel, row_height)])
+    return np.hstack([_pad_to_height(camera_panel, row_height), _pad_to_height(top_panel, row_height)])
 
 
-def _padded(image: U8, height: int) -> U8:
+def _pad_to_height(image: U8, height: int) -> U8:
     return np.pad(image, ((0, height - len(image)), (0, 0), (0, 0)))
 
 
@@ -113,12 +118,12 @@ def _nearest_record(records: Sequence[tuple[float, Any]], time: float) -> Any:
     return min(records, key=lambda record: abs(record[0] - time))[1] if records else None
 
 
-def _marked_image(image: U8, trace: EpisodeTrace, step: int, time: float, perceived: Perceived) -> U8:
+def _mark_objects(image: U8, trace: EpisodeTrace, step: int, time: float, perceived: DrivePerception) -> U8:
     """A stake on the road for each object found (orange) and believed (blue)."""
     camera = next(iter(perceived.cameras.values()))
     factor = image.shape[1] / camera.width
     ego = (float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-    detections, tracks = _nearest_record(perceived.looks, time), _nearest_record(perceived.known, time)
+    detections, tracks = _nearest_record(perceived.detections, time), _nearest_record(perceived.tracks, time)
     for positions, colour in (
         ([] if detections is None else detections.place, DETECTED),
         ([] if tracks is None else tracks.place, BELIEVED),
@@ -137,7 +142,7 @@ def _marked_image(image: U8, trace: EpisodeTrace, step: int, time: float, percei
     return image
 
 
-def _top_view(trace: EpisodeTrace, step: int, time: float, perceived: Perceived, graph: LaneGraph) -> U8:
+def _top_view(trace: EpisodeTrace, step: int, time: float, perceived: DrivePerception, graph: LaneGraph) -> U8:
     """From above, the ego's heading up."""
     canvas = np.full((VIEW_HEIGHT, WIDTH, 3), GROUND, np.uint8)
     ego = np.array([trace.x[step, 0], trace.y[step, 0], trace.yaw[step, 0]], np.float64)
@@ -149,7 +154,7 @@ def _top_view(trace: EpisodeTrace, step: int, time: float, perceived: Perceived,
         return np.rint(np.stack([columns, rows], 1)).astype(np.int32)
 
     is_near = np.hypot(graph.xy[:, 0] - ego[0], graph.xy[:, 1] - ego[1]) < 90.0
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         vertices = slice(graph.offset[lane], graph.offset[lane + 1])
         if is_near[vertices].any():
             cv2.polylines(canvas, [pixels(graph.xy[vertices])], False, LANE, 2, cv2.LINE_AA)
@@ -158,20 +163,20 @@ def _top_view(trace: EpisodeTrace, step: int, time: float, perceived: Perceived,
         colour = EGO if agent == 0 else VISIBLE if visible[agent] else HIDDEN
         pose = np.array([trace.x[step, agent], trace.y[step, agent], trace.yaw[step, agent]], np.float64)
         size = np.array([trace.length[agent], trace.width[agent]], np.float64)
-        cv2.fillPoly(canvas, [pixels(_corners(pose, size))], colour, cv2.LINE_AA)
-    detections, tracks = _nearest_record(perceived.looks, time), _nearest_record(perceived.known, time)
+        cv2.fillPoly(canvas, [pixels(_rectangle(pose, size))], colour, cv2.LINE_AA)
+    detections, tracks = _nearest_record(perceived.detections, time), _nearest_record(perceived.tracks, time)
     if detections is not None:
         for x, y in pixels(detections.place).tolist():
             cv2.drawMarker(canvas, (x, y), DETECTED, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
     if tracks is not None:
         for place, velocity, yaw, size in zip(tracks.place, tracks.velocity, tracks.yaw, tracks.size, strict=True):
-            outline = pixels(_corners(np.array([*place, yaw]), size))
+            outline = pixels(_rectangle(np.array([*place, yaw]), size))
             cv2.polylines(canvas, [outline], True, BELIEVED, 2, cv2.LINE_AA)
             cv2.polylines(canvas, [pixels([place, place + velocity])], False, BELIEVED, 1, cv2.LINE_AA)
     return canvas
 
 
-def _corners(pose: F64, size: F64) -> F64:
+def _rectangle(pose: F64, size: F64) -> F64:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     local_corners = 0.5 * size * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
     return np.asarray(local_corners @ np.array([[cos, sin], [-sin, cos]]) + pose[:2])

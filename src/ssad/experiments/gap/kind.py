@@ -15,7 +15,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.core.traces import first_difference, load_trace
 from ssad.drivers.perceiving.system import PerceivingSystem
@@ -24,7 +24,13 @@ from ssad.experiments.gap import page
 from ssad.experiments.gap.drive_sheet import RecordedDrive, drive_film, drive_sheet
 from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
 from ssad.experiments.gap.verdict import verdict
-from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
+from ssad.experiments.scenario_kind import (
+    DescribedScenario,
+    ScenarioKind,
+    ScenarioSuite,
+    describe_scenarios,
+    drive_record,
+)
 from ssad.metrics.driving import LIMITS
 from ssad.metrics.perception_in_drive import (
     BANDS,
@@ -41,7 +47,7 @@ from ssad.report.tables import Table
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable
 from ssad.scenarios.static.perturbation import EGO, Perturbation
 from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
-from ssad.simulators.closed_loop import cached_town, episode_of, system_version
+from ssad.simulators.closed_loop import build_requested_episode, cached_town, system_version
 
 FRAME_INTERVAL = 0.2  # s from one frame of a film to the next
 
@@ -123,13 +129,13 @@ class Gap(ScenarioKind):
             system.check()
         versions = {entry.name: entry.version for entry in suite.systems}
         versions |= {name: system_version(name) for name in suite.ceilings}
-        scenarios, towns = described(suite)
+        scenarios, towns = describe_scenarios(suite)
         conditions = conditions_of(suite)
         targeted = [condition for condition in conditions if condition.needs_target]
         targets: dict[tuple[str, str], int | None] = {}
         if check or targeted:
             for entry in scenarios:
-                episode = episode_of(self._cell(suite, entry, conditions[0], 0, "", EGO))
+                episode = build_requested_episode(self._cell(suite, entry, conditions[0], 0, "", EGO))
                 for condition in targeted:
                     assert condition.perturbation is not None
                     agent = condition.perturbation.applies_to(episode, cached_town(entry.scenario.town))
@@ -147,7 +153,7 @@ class Gap(ScenarioKind):
     def _cell(  # noqa: PLR0917  # plain values
         self,
         suite: GapSuite,
-        described_scenario: Described,
+        described_scenario: DescribedScenario,
         condition: Condition,
         repetition: int,
         version: str,
@@ -211,12 +217,12 @@ class Gap(ScenarioKind):
             metrics = result["metrics"] | {"impact_speed": impact_speed(trace), "hard_braking": hard_braking(trace)}
             record_fields: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
             if perception is not None:
-                system, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), perception.perceived(index)
+                system, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), perception.perception(index)
                 metrics |= component_metrics(trace, perceived, phantom_score=system.tracking.high)
                 metrics |= sign_metrics(trace, perceived, signs_of_route(cached_town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
-                if job.settings["sheets"] and (sheet_images := perception.shots(index)):
+                if job.settings["sheets"] and (sheet_images := perception.images(index)):
                     result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"
                     safeio.make_folder(job.folder / "sheets")
                     picture = drive_sheet(trace, perceived, sheet_images, cached_town(trace.town))
@@ -229,7 +235,7 @@ class Gap(ScenarioKind):
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
         """Drive the episode again and compare every bit of its trace; film it beside the clean drive."""
-        quiet_warp()
+        start_warp_quietly()
         recorded = load_trace(folder / record["artefacts"]["trace"])
         spec, graph = cell.spec, cached_town(recorded.town)
         # The clean drive shows what the perturbation alone changes.
@@ -241,13 +247,13 @@ class Gap(ScenarioKind):
             )
             replayed_traces.append(trace)
             if perception is not None:
-                images = perception.shots(0)
+                images = perception.images(0)
                 title = (
                     f"{cell.fields['perturbation']} {spec['severity']}"
                     if driven_cell is cell and spec["severity"]
                     else "clean"
                 )
-                drives.append(RecordedDrive(title, trace, perception.perceived(0), images))
+                drives.append(RecordedDrive(title, trace, perception.perception(0), images))
         filmed_drives = [drive for drive in drives if drive.shots]
         drive_film_frames = (
             (drive_film(filmed_drives, graph, frame_interval=FRAME_INTERVAL), FRAME_INTERVAL) if filmed_drives else None
@@ -259,7 +265,7 @@ class Gap(ScenarioKind):
             replayed_traces[-1],
             graph,
             film=drive_film_frames,
-            seen=driver_perception,
+            perception=driver_perception,
         )
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
@@ -315,7 +321,7 @@ def conditions_of(suite: GapSuite) -> list[Condition]:
         suite.conditions()
     except ConfigError as error:
         raise type(error)(f"suite {suite.name}: {error}") from None
-    made = [
+    perturbations = [
         (perturbation, entry.model_dump(mode="json"))
         for entry in suite.perturbations
         for perturbation in entry.at(suite.severities)
@@ -323,6 +329,6 @@ def conditions_of(suite: GapSuite) -> list[Condition]:
     conditions = [Condition(name) for name in suite.ceilings]
     for system in suite.systems:
         conditions.append(Condition(system))
-        if not system.perfect:
-            conditions += [Condition(system, perturbation, entry) for perturbation, entry in made]
+        if not system.is_perfect:
+            conditions += [Condition(system, perturbation, entry) for perturbation, entry in perturbations]
     return conditions

@@ -37,7 +37,7 @@ COLOURS: Final = {
 Message = tuple[int, str, Any]  # ns, topic, message
 
 
-def need_mcap() -> None:
+def require_mcap() -> None:
     """Raise ConfigError if the packages of the extra `view` are missing."""
     try:
         importlib.import_module("mcap_protobuf.writer")
@@ -70,13 +70,13 @@ def write_mcap(
         ConfigError: The extra `view` is missing.
         StoreError: The file cannot be written.
     """
-    need_mcap()
+    require_mcap()
     from mcap_protobuf.writer import Writer
 
     messages = [
-        *_scene(trace, graph),
-        *_from_above(trace, top_views),
-        *(() if recorded_drive is None else _perceived(recorded_drive)),
+        *_scene_messages(trace, graph),
+        *_top_view_messages(trace, top_views),
+        *(() if recorded_drive is None else _perception_messages(recorded_drive)),
     ]
     with safeio.atomic_path(path) as temporary, temporary.open("wb") as file, Writer(file) as writer:
         # Viewers expect log times in order; the sort is stable, so topics of one time keep theirs.
@@ -87,7 +87,7 @@ def write_mcap(
     return path
 
 
-def _new(name: str, time: int | None = None, **fields: Any) -> Any:
+def _new_message(name: str, time: int | None = None, **fields: Any) -> Any:
     """Build a message of Foxglove's schemas."""
     message = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)(**fields)
     if time is not None:
@@ -95,26 +95,26 @@ def _new(name: str, time: int | None = None, **fields: Any) -> Any:
     return message
 
 
-def _ns(seconds: float) -> int:
+def _nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
+def _scene_messages(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
     """Yield the map once, and the poses of all agents and the plan at each step."""
-    yield 0, "/map", _update("map", 0, lines=list(_lanes(graph)))
+    yield 0, "/map", _scene_update("map", 0, lines=list(_lanes(graph)))
     names = [f"{agent_index} {name}" for agent_index, name in enumerate(trace.names)]
     for step in range(len(trace.x)):
-        time = _ns(step * trace.dt)
+        time = _nanoseconds(step * trace.dt)
         pose = np.stack([trace.x[step], trace.y[step], trace.yaw[step]], -1).astype(np.float64)
         yield time, "/tf", _transform(time, WORLD, EGO, [*pose[0, :2], 0.0], yaw_to_quaternion(pose[0, 2]))
         rows = np.flatnonzero(trace.active[step])
         size = np.stack([trace.length[rows], trace.width[rows]], -1)
         kind = trace.kind[rows].astype(np.int64)
-        cubes = _cubes("truth", pose[rows], size.astype(np.float64), kind)
+        cubes = _upright_boxes("truth", pose[rows], size.astype(np.float64), kind)
         yield (
             time,
             "/truth",
-            _update("truth", time, cubes=cubes, words={names[agent_index]: "" for agent_index in rows.tolist()}),
+            _scene_update("truth", time, cubes=cubes, words={names[agent_index]: "" for agent_index in rows.tolist()}),
         )
         route = trace.route.astype(np.float64)
         # The plan begins where the ego is now, not where the route begins.
@@ -122,51 +122,59 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
         route_distance = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(route[nearest_point:], axis=0).T)]))
         line = _line("plan", route[nearest_point:][route_distance <= PLAN_LENGTH])
         controls = {name: f"{getattr(trace, name)[step]:.3f}" for name in ("throttle", "brake", "steer")}
-        yield time, "/plan", _update("plan", time, lines=[line], words=controls)
+        yield time, "/plan", _scene_update("plan", time, lines=[line], words=controls)
 
 
-def _perceived(recorded_drive: RecordedDrive) -> Iterator[Message]:
+def _perception_messages(recorded_drive: RecordedDrive) -> Iterator[Message]:
     """Yield the images, detections and beliefs of the driver."""
     for seconds, image in recorded_drive.shots:  # none of a perceiver without cameras
         name, camera = next(iter(recorded_drive.perceived.cameras.items()))
         camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
-        time = _ns(seconds)
+        time = _nanoseconds(seconds)
         jpeg = encode_jpeg(np.ascontiguousarray(image), QUALITY, "420")
         yield time, "/tf", _transform(time, EGO, name, camera_position, camera_rotation)
-        yield time, "/camera", _new("CompressedImage", time, frame_id=name, data=jpeg, format="jpeg")
+        yield time, "/camera", _new_message("CompressedImage", time, frame_id=name, data=jpeg, format="jpeg")
         yield time, "/camera/calibration", _calibration(time, name, camera)
-    for seconds, detections in recorded_drive.perceived.looks:
+    for seconds, detections in recorded_drive.perceived.detections:
         if detections is not None:
             pose = np.column_stack([detections.place, np.nan_to_num(detections.yaw)])
-            cubes = _cubes("detections", pose, detections.size, detections.kind)
+            cubes = _upright_boxes("detections", pose, detections.size, detections.kind)
             metadata = {f"score {row}": f"{score:.3f}" for row, score in enumerate(detections.score.tolist())}
-            yield _ns(seconds), "/detections", _update("detections", _ns(seconds), cubes=cubes, words=metadata)
-    for seconds, tracks in recorded_drive.perceived.known:
-        cubes = _cubes("tracks", np.column_stack([tracks.place, tracks.yaw]), tracks.size, tracks.kind)
+            yield (
+                _nanoseconds(seconds),
+                "/detections",
+                _scene_update("detections", _nanoseconds(seconds), cubes=cubes, words=metadata),
+            )
+    for seconds, tracks in recorded_drive.perceived.tracks:
+        cubes = _upright_boxes("tracks", np.column_stack([tracks.place, tracks.yaw]), tracks.size, tracks.kind)
         metadata = {f"track {row}": str(track_id) for row, track_id in enumerate(tracks.ident.tolist())}
-        yield _ns(seconds), "/tracks", _update("tracks", _ns(seconds), cubes=cubes, words=metadata)
+        yield (
+            _nanoseconds(seconds),
+            "/tracks",
+            _scene_update("tracks", _nanoseconds(seconds), cubes=cubes, words=metadata),
+        )
 
 
-def _from_above(trace: EpisodeTrace, top_views: Iterable[U8]) -> Iterator[Message]:
+def _top_view_messages(trace: EpisodeTrace, top_views: Iterable[U8]) -> Iterator[Message]:
     for step, top_view in enumerate(top_views):
-        time, jpeg = _ns(step * trace.dt), encode_jpeg(np.ascontiguousarray(top_view), QUALITY, "420")
-        yield time, "/above", _new("CompressedImage", time, frame_id=ABOVE, data=jpeg, format="jpeg")
+        time, jpeg = _nanoseconds(step * trace.dt), encode_jpeg(np.ascontiguousarray(top_view), QUALITY, "420")
+        yield time, "/above", _new_message("CompressedImage", time, frame_id=ABOVE, data=jpeg, format="jpeg")
 
 
-def _update(name: str, time: int, *, words: dict[str, str] | None = None, **entities: Any) -> Any:
+def _scene_update(name: str, time: int, *, words: dict[str, str] | None = None, **entities: Any) -> Any:
     """A scene in place of the one before under this name."""
-    metadata = [_new("KeyValuePair", key=key, value=value) for key, value in (words or {}).items()]
+    metadata = [_new_message("KeyValuePair", key=key, value=value) for key, value in (words or {}).items()]
     # Viewers replace an entity by the next one with the same id.
-    entity = _new("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **entities)
-    return _new("SceneUpdate", entities=[entity])
+    entity = _new_message("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **entities)
+    return _new_message("SceneUpdate", entities=[entity])
 
 
 def _colour(name: str) -> Any:
     red, green, blue, opacity = COLOURS[name]
-    return _new("Color", r=red, g=green, b=blue, a=opacity)
+    return _new_message("Color", r=red, g=green, b=blue, a=opacity)
 
 
-def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
+def _upright_boxes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
     """Build upright boxes at x, y, yaw [N, 3], of lengths and widths [N, 2].
 
     The heights are those usual for their kinds [N].
@@ -177,14 +185,16 @@ def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
         pose.tolist(), size.tolist(), rotations, kind, strict=True
     ):
         height = float(SIZES[min(int(agent_kind), len(AgentKind) - 1), 2])
-        cube_pose = _new("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(rotation))
-        cubes.append(_new("CubePrimitive", pose=cube_pose, size=_vector([length, width, height]), color=_colour(name)))
+        cube_pose = _new_message("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(rotation))
+        cubes.append(
+            _new_message("CubePrimitive", pose=cube_pose, size=_vector([length, width, height]), color=_colour(name))
+        )
     return cubes
 
 
 def _line(name: str, points: F64, height: float = 0.05) -> Any:
-    vertices = [_new("Point3", x=x, y=y, z=height) for x, y in points.tolist()]
-    return _new("LinePrimitive", thickness=0.15, points=vertices, color=_colour(name), pose=_origin())
+    vertices = [_new_message("Point3", x=x, y=y, z=height) for x, y in points.tolist()]
+    return _new_message("LinePrimitive", thickness=0.15, points=vertices, color=_colour(name), pose=_origin())
 
 
 def _lanes(graph: LaneGraph) -> Iterator[Any]:
@@ -194,20 +204,22 @@ def _lanes(graph: LaneGraph) -> Iterator[Any]:
 
 
 def _origin() -> Any:
-    return _new("Pose", position=_vector([0.0, 0.0, 0.0]), orientation=_quaternion(np.array([1.0, 0.0, 0.0, 0.0])))
+    return _new_message(
+        "Pose", position=_vector([0.0, 0.0, 0.0]), orientation=_quaternion(np.array([1.0, 0.0, 0.0, 0.0]))
+    )
 
 
 def _vector(values: Sequence[float]) -> Any:
-    return _new("Vector3", x=values[0], y=values[1], z=values[2])
+    return _new_message("Vector3", x=values[0], y=values[1], z=values[2])
 
 
 def _quaternion(rotation: F64) -> Any:
     w, x, y, z = rotation.tolist()
-    return _new("Quaternion", x=x, y=y, z=z, w=w)
+    return _new_message("Quaternion", x=x, y=y, z=z, w=w)
 
 
 def _transform(time: int, parent: str, child: str, translation: Sequence[float], rotation: F64) -> Any:
-    return _new(
+    return _new_message(
         "FrameTransform",
         time,
         parent_frame_id=parent,
@@ -220,7 +232,7 @@ def _transform(time: int, parent: str, child: str, translation: Sequence[float],
 def _calibration(time: int, name: str, camera: Camera) -> Any:
     intrinsic = camera.intrinsic
     projection = np.column_stack([intrinsic, np.zeros(3)])
-    return _new(
+    return _new_message(
         "CameraCalibration",
         time,
         frame_id=name,

@@ -11,7 +11,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
 from ssad.core.types import Episode, EpisodeTrace
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
-from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.repair import RepairedAgents
 from ssad.drivers.perceiving.sensors import sensor_suite
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.experiments.gap.other_drives import images_of_other_drives
@@ -22,29 +22,29 @@ from ssad.simulators.closed_loop import EpisodeRequest, drive
 
 
 def drive_perceiving(
-    orders: Sequence[EpisodeRequest],
+    requests: Sequence[EpisodeRequest],
     *,
     device: str,
     seed: int,
-    repair: Repair | None = None,
+    repair: RepairedAgents | None = None,
     image_interval: float | None = 0.5,
 ) -> tuple[list[Episode], list[EpisodeTrace], PerceptionRecorder | None]:
-    """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
+    """Return episodes and traces of requests of one system under one perturbation, and what was perceived in them.
 
     Args:
-        orders: What is to be driven; their specs say settings (of a `PerceivingSystem`; None: another driver),
+        requests: What is to be driven; their specs say settings (of a `PerceivingSystem`; None: another driver),
             perturbation, severity, and the agent that it is on.
         device: Where the world and the cameras compute.
         seed: Of the perturbations.
         repair: What mends one error of the driver.
         image_interval: s from one picture that is kept to the next; None: none are kept.
     """
-    spec = orders[0].spec
+    spec = requests[0].spec
     if spec["settings"] is None:
-        return *drive(orders, device=device, key=_paired)[:2], None
+        return *drive(requests, device=device, key=_pairing_key)[:2], None
     system = PerceivingSystem.model_validate(spec["settings"])
-    watcher = PerceptionRecorder(system.views, len(orders), image_interval)
-    driver = system.make(watcher, repair=repair, device=device)
+    recorder = PerceptionRecorder(system.view_cameras, len(requests), image_interval)
+    driver = system.make(recorder, repair=repair, device=device)
     perturbation = perturbation_of(spec)
     if perturbation is not None and perturbation.needs_victim and driver.detector is None:
         raise ConfigError(
@@ -59,9 +59,9 @@ def drive_perceiving(
     if perturbation is not None:
         suite = perturbation.in_loop(suite, target=spec["target"], victim=driver.detector, seed=seed)
     drive_results = drive(
-        orders, device=device, key=_paired, driver=driver, sensors=suite.build(), perturbation=suite.changes
+        requests, device=device, key=_pairing_key, driver=driver, sensors=suite.build(), perturbation=suite.changes
     )
-    return *drive_results[:2], watcher
+    return *drive_results[:2], recorder
 
 
 def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:
@@ -72,12 +72,12 @@ def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:
 
 
 def drive_repaired(
-    orders: Sequence[EpisodeRequest], traces: Sequence[EpisodeTrace], *, device: str, seed: int
+    requests: Sequence[EpisodeRequest], traces: Sequence[EpisodeTrace], *, device: str, seed: int
 ) -> dict[int, dict[str, Any]]:
     """Drives that ended in a collision driven again with whom they hit found where it is: does that one error decide?
 
     Args:
-        orders: What was driven.
+        requests: What was driven.
         traces: What happened.
         device: See `drive_perceiving`.
         seed: See `drive_perceiving`.
@@ -91,9 +91,9 @@ def drive_repaired(
     }
     if not struck_agents:
         return {}
-    repair = Repair(dict(enumerate(struck_agents.values())))
+    repair = RepairedAgents(dict(enumerate(struck_agents.values())))
     _, repaired_traces, _ = drive_perceiving(
-        [orders[index] for index in struck_agents], device=device, seed=seed, repair=repair, image_interval=None
+        [requests[index] for index in struck_agents], device=device, seed=seed, repair=repair, image_interval=None
     )
     return {
         index: {
@@ -104,6 +104,6 @@ def drive_repaired(
     }
 
 
-def _paired(order: EpisodeRequest) -> str:
+def _pairing_key(request: EpisodeRequest) -> str:
     """Pictures are keyed by the episode: conditions of one drive must share their noise and weather."""
-    return digest("gap", order.spec["scenario"]["name"], order.seed)[:16]
+    return digest("gap", request.spec["scenario"]["name"], request.seed)[:16]

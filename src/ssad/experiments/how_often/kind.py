@@ -11,16 +11,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ssad.core.errors import ConfigError
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE
-from ssad.core.safeio import plain
+from ssad.core.safeio import to_plain_json
 from ssad.core.schema import Schema
 from ssad.core.traces import save_trace
 from ssad.core.types import EpisodeTrace, Scenario
 from ssad.engine.kind import Cell, Column, Job, Names, Plan
 from ssad.experiments.how_often.failure_rate import METHODS, ChanceEpisode, Method, first_obstacle
 from ssad.experiments.how_often.verdict import contradictions, unbranched, verdict
-from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, described
+from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, describe_scenarios
 from ssad.report import default
 from ssad.report.load import Run
 from ssad.report.tables import Table
@@ -102,7 +102,7 @@ class HowOften(ScenarioKind):
             ConfigError: The input is wrong, or every cell has a method that needs branches and a system without.
         """
         systems = {name: system_version(name) for name in suite.systems}
-        scenarios, towns = described(suite)
+        scenarios, towns = describe_scenarios(suite)
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
         cells = tuple(
             self.scenario_cell(
@@ -129,10 +129,10 @@ class HowOften(ScenarioKind):
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Estimate the probability; keep the likeliest collision."""
-        quiet_warp()
+        start_warp_quietly()
         episode = chance_of(cell, job.device)
         metrics, crash = episode.estimate(cell.spec["method"], **{name: cell.spec[name] for name in SETTINGS})
-        result: dict[str, Any] = {"metrics": plain(metrics), "case": cell.key, "n": metrics["episodes"]}
+        result: dict[str, Any] = {"metrics": to_plain_json(metrics), "case": cell.key, "n": metrics["episodes"]}
         if obstacle := episode.obstacle():
             result["obstacle"] = obstacle
         if crash is None:

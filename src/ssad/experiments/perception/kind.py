@@ -21,7 +21,7 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
 from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind, TargetCondition
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, score_scenes, sum_applied
 from ssad.experiments.perception.scored_data import Victims, data_of, detectors_of
 from ssad.experiments.perception.sheets import detection_sheet
@@ -146,7 +146,7 @@ class Perception(OpenLoopKind):
         """Return the images of the cell's target, and its perturbation."""
         target: str = cell.fields["data"]
         folder = job.folder / "data" / target_folder(target)
-        images = LightableClips.of(folder, job.settings["target_images"], detector, job.device)
+        images = RelightableTargetImages.of(folder, job.settings["target_images"], detector, job.device)
         return TargetCondition(images, perturbation_of(cell), target)
 
     def note(self, run: Run) -> str:

@@ -19,19 +19,19 @@ from rich.console import Console
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import save_picture
-from ssad.core.machine import default_workers, keep_memory, quiet_warp
+from ssad.core.machine import default_workers, retain_freed_memory, start_warp_quietly
 from ssad.core.protocols import Detector
 from ssad.core.run_records import SHARE
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData
-from ssad.detectors import loaded_detector
+from ssad.detectors import cached_detector
 from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Replay, Resources, SuiteBase
-from ssad.engine.progress import Live
-from ssad.engine.replay import difference
+from ssad.engine.progress import LiveProgress
+from ssad.engine.replay import describe_difference
 from ssad.engine.run import hash_artefacts
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.scene_boxes import (
     Examination,
     SceneCondition,
@@ -97,7 +97,7 @@ class TargetCondition:
         name: The target in words.
     """
 
-    images: LightableClips
+    images: RelightableTargetImages
     perturbation: Perturbation | None
     name: str
 
@@ -234,7 +234,7 @@ class OpenLoopKind(Kind):
             settings |= {"root": str(root.resolve()), "version": version, "scenes": tokens}
         recordings = self.recordings(plan, folder)
         if recordings:
-            with Live("recording targets", 1, 0, console=resources.console, unit="parts") as progress:
+            with LiveProgress("recording targets", 1, 0, console=resources.console, unit="parts") as progress:
                 record_all(recordings, workers=resources.workers, ray=resources.ray, progress=progress.show)
         settings |= self.settings(suite, scenes)
         job = Job(folder, plan.device, settings)
@@ -246,8 +246,8 @@ class OpenLoopKind(Kind):
 
     def start(self, job: Job) -> None:
         """Keep the memory of tensors, and silence Warp."""
-        keep_memory()
-        quiet_warp()
+        retain_freed_memory()
+        start_warp_quietly()
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Return the scenes whose boxes are still to be found, by name, with a cell that they belong to."""
@@ -281,7 +281,7 @@ class OpenLoopKind(Kind):
     def _target_result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Return the scores of a cell on images of its target."""
         settings, weights = job.settings, job.settings["detectors"].get(cell.system) or None
-        detector = loaded_detector(cell.system, weights=weights, device=job.device)
+        detector = cached_detector(cell.system, weights=weights, device=job.device)
         condition = self.target(cell, job, detector)
         images, perturbation = condition.images, condition.perturbation
         bootstrap = {"replicates": settings["replicates"], "seed": settings["seed"]}
@@ -357,7 +357,7 @@ class OpenLoopKind(Kind):
         make_picture, _ = self.sheet(examination, plan.suite, cell)
         return Replay(
             cell,
-            difference(record, result),
+            describe_difference(record, result),
             picture=make_picture,
             compared=(
                 f"{len(result['metrics'])} metrics, {equal_files} of {len(hashes)} files of boxes the same to the bit"
@@ -390,7 +390,7 @@ def _recorded_scenes(
     root = Path(suite.data).expanduser()
     if suite.data == RECORDED:
         total = suite.recorded.scenes * len(suite.recorded.towns)
-        with Live("recording", total, 0, console=resources.console, unit="scenes") as progress:
+        with LiveProgress("recording", total, 0, console=resources.console, unit="scenes") as progress:
             root = record_nuscenes(
                 recording_of(suite, folder / "data"),
                 workers=resources.workers,
@@ -409,6 +409,6 @@ def _recorded_scenes(
 
 
 @lru_cache(maxsize=8)
-def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
+def _clean_sightings(images: RelightableTargetImages, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
     """Return a detector's sightings in clean images, which all cells of a target are compared with."""
-    return tuple(sightings(loaded_detector(detector, weights=weights, device=images.device), images.clean()))
+    return tuple(sightings(cached_detector(detector, weights=weights, device=images.device), images.clean()))

@@ -21,13 +21,13 @@ import torch
 from ssad.core import safeio
 from ssad.core.boxes import size_columns
 from ssad.core.errors import FormatError, SSADError
-from ssad.core.machine import keep_memory, quiet_warp
+from ssad.core.machine import retain_freed_memory, start_warp_quietly
 from ssad.core.seeding import digest, file_name, generator
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detectors import loaded_detector, make_detector
+from ssad.detectors import cached_detector, make_detector
 from ssad.detectors.image_scores import (
     ImageBoxes,
     ImageTruth,
@@ -41,7 +41,7 @@ from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.detectors.on_scenes import AT_ONCE, SampleBoxes, detect_with, match_boxes, score_figures
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.digital.defences import Defence, Defended
-from ssad.scenarios.static.perturbation import Look, Perturbation, PerturbedScene, RecordedScene
+from ssad.scenarios.static.perturbation import ImageLoader, Perturbation, PerturbedScene, RecordedScene
 
 FOLDER = "detections"
 CAMERAS = 6  # of a sample, as nuScenes has them
@@ -110,8 +110,8 @@ class SceneCondition:
             victim = next((detector for detector in detectors if detector.name == self.source), None)
             victim = victim or MonitoredDetector(system_of(examination, self.source), self.source)
         presentation = self.perturbation.on_scene(recorded_scene(examination, data, self), victim)
-        if victim is not None and presentation.look is not None:
-            presentation.look = _passing_failures(presentation.look, victim, detectors)
+        if victim is not None and presentation.load_images is not None:
+            presentation.load_images = _share_failures(presentation.load_images, victim, detectors)
         return presentation
 
 
@@ -130,11 +130,13 @@ def recorded_scene(examination: Examination, data: NuScenes, condition: SceneCon
     )
 
 
-def _passing_failures(look: Look, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]) -> Look:
+def _share_failures(
+    perturb_images: ImageLoader, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]
+) -> ImageLoader:
     """Return a function of images after which a failure of the victim is one of all detectors."""
 
     def look_and_pass(frames: Sequence[SensorFrame]) -> Sequence[U8]:
-        images = look(frames)
+        images = perturb_images(frames)
         for detector in detectors:
             if victim.reason and detector is not victim and not detector.reason:
                 detector.reason = f"the attack on {victim.name} failed: {victim.reason}"
@@ -162,11 +164,11 @@ def system_of(examination: Examination, name: str) -> Any:
     """
     detector_name, defence = examination.defended.get(name, (name, None))
     weights = dict(examination.detectors)[detector_name]
-    quiet_warp()  # it runs the shifts
+    start_warp_quietly()  # it runs the shifts
     torch.set_num_threads(examination.threads)
     if examination.device == "cpu":
-        keep_memory()
-    detector = loaded_detector(detector_name, weights=weights or None, device=examination.device)
+        retain_freed_memory()
+    detector = cached_detector(detector_name, weights=weights or None, device=examination.device)
     return detector if defence is None else Defended(detector, defence)
 
 
@@ -197,12 +199,12 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
             examination.root,
             dataset.scene(scene.scene),
             device=examination.device,
-            look=presentation.look,
+            load_images=presentation.load_images,
             ahead=presentation.ahead,
             at_once=samples_at_once(presentation),
         )
     for name, samples, monitored_detector in zip(missing_names, boxes_by_detector, monitored, strict=True):
-        _write(
+        _write_boxes(
             boxes_path(folder, name, scene),
             samples,
             monitored_detector.reason,
@@ -212,7 +214,7 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
     presentation.done()
 
 
-def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, is_2d: bool) -> None:
+def _write_boxes(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, is_2d: bool) -> None:
     columns: dict[str, Any] = {"failed": np.array(reason)} if reason else {}
     if not reason:
         boxes = [sample.boxes for sample in samples]
@@ -333,7 +335,7 @@ def score_scenes(
     """
     boxes, scene_notes = read_scenes(examination, detector, scenes)
     truth = truth_of(examination, [condition.scene for condition in scenes])
-    return {**score_found(examination, detector, boxes, truth, replicates=replicates), **notes(scene_notes)}
+    return {**score_boxes(examination, detector, boxes, truth, replicates=replicates), **notes(scene_notes)}
 
 
 def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
@@ -366,7 +368,7 @@ def read_scenes(
     return all_boxes, scene_notes
 
 
-def score_found(
+def score_boxes(
     examination: Examination, detector: str, boxes_by_sample: Sequence[Any], truth: GroundTruth, *, replicates: int
 ) -> dict[str, Any]:
     """As `score_scenes`, of boxes that are at hand: in the world, or of a 2D detector in the images.
@@ -385,7 +387,7 @@ def score_found(
     else:
         matches = match_boxes(boxes_by_sample, truth)
         figures = lambda weights, summary_only: score_figures(matches.scores(weights), summary_only=summary_only)  # noqa: E731
-    return _resampled(examination, figures, truth, replicates)
+    return _add_intervals(examination, figures, truth, replicates)
 
 
 def picture_truth_of(examination: Examination, truth: GroundTruth) -> ImageTruth:
@@ -397,7 +399,7 @@ Figures = Callable[[Any, bool], dict[str, float]]
 """From weights of the samples (None: each once), and whether a few are enough, to figures by name."""
 
 
-def _resampled(examination: Examination, figures: Figures, truth: GroundTruth, replicates: int) -> dict[str, Any]:
+def _add_intervals(examination: Examination, figures: Figures, truth: GroundTruth, replicates: int) -> dict[str, Any]:
     """Return figures, and their intervals by the bootstrap over scenes."""
     drive_of_scene = distinct_scenes(truth)
     drive_count = int(drive_of_scene.max()) + 1

@@ -26,7 +26,7 @@ from ssad.rendering.target import Target, class_of_target
 RECORDED = "recorded"
 
 
-class Recorded(Schema):
+class RecordedData(Schema):
     """Validation set that is recorded by default: drives in towns that the shipped detectors never saw.
 
     Attributes:
@@ -61,7 +61,7 @@ class DetectorTable(Schema):
     data: str = Field(default=RECORDED, min_length=1)
     version: str | None = None
     split: str = "val"
-    recorded: Recorded = Recorded()
+    recorded: RecordedData = RecordedData()
 
 
 class Victims(NamedTuple):
@@ -107,7 +107,7 @@ def detectors_of(
             if weights_file and weights_file != "random"
             else weights_file
         )
-        detector_name = Reference.of(name).name
+        detector_name = Reference.parse(name).name
         if not path and detector_name in DETECTORS and not (SHIPPED / f"{detector_name}.json").is_file():
             raise ConfigError(
                 f"suite {suite}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "

@@ -12,7 +12,7 @@ import torch
 
 from ssad.core.detections import to_images
 from ssad.core.images import read_image
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.datasets.drawing import title_on
 from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
@@ -41,25 +41,27 @@ def detection_sheet(examination: Examination, split: str, perturbations: Sequenc
     Raises:
         FormatError: an image cannot be read.
     """
-    quiet_warp()
+    start_warp_quietly()
     name, weights = examination.detectors[0]
     detector = MonitoredDetector(detector_of(name, weights, examination.device)), examination.device
     with NuScenes(examination.root, examination.version) as dataset:
-        scene, frame = richest(dataset, scenes_of(dataset, split))
-        tiles = [tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
+        scene, frame = frame_with_most_objects(dataset, scenes_of(dataset, split))
+        tiles = [draw_tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
         for perturbation in perturbations:
             condition = SceneCondition(scene.record.name, perturbation)
             recorded = replace(recorded_scene(examination, dataset, condition), folder=None)
             presentation = perturbation.on_scene(recorded, detector[0])
-            assert presentation.look is not None
-            tiles.append(tile(detector, scene, frame, presentation.look([frame])[0], title=perturbation.name))
+            assert presentation.load_images is not None
+            tiles.append(
+                draw_tile(detector, scene, frame, presentation.load_images([frame])[0], title=perturbation.name)
+            )
     while len(tiles) % COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[start : start + COLUMNS], 1) for start in range(0, len(tiles), COLUMNS)]
     return np.concatenate(rows)
 
 
-def richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorFrame]:
+def frame_with_most_objects(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorFrame]:
     """The camera frame with most objects within 30 m, by day if it can be, among the first of each scene."""
     best_candidate: tuple[float, SceneData, SensorFrame] | None = None
     for name in scenes:
@@ -80,9 +82,11 @@ def richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorF
 
 
 @torch.no_grad()
-def tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, *, title: str) -> U8:
+def draw_tile(
+    detector_and_device: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, *, title: str
+) -> U8:
     """A picture with the boxes of a detector (on a device) and the true ones, and its name."""
-    detector, device = eye
+    detector, device = detector_and_device
     truth = camera_truth(frame, scene.annotations(frame.sample_token))
     assert frame.intrinsic is not None
     assert truth.solid is not None

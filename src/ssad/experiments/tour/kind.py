@@ -104,7 +104,7 @@ class Tour(Kind):
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Count the cells of the part."""
-        return counted(job.folder, cell.system)
+        return count_cells(job.folder, cell.system)
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
         """Return the page of a run and its tables."""
@@ -115,7 +115,7 @@ class Tour(Kind):
         return page.summary(run)
 
 
-def counted(folder: Path, name: str) -> dict[str, Any]:
+def count_cells(folder: Path, name: str) -> dict[str, Any]:
     """Return the cells of a part, and their seconds.
 
     Raises:

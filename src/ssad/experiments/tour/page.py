@@ -29,8 +29,8 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     parts, tables = [], []
     for part_settings in run.suite["parts"]:
         name = str(part_settings["name"])
-        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_about(part_settings)}
-        part_run, problem = _read(run.folder / name)
+        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_describe_part(part_settings)}
+        part_run, problem = _read_run(run.folder / name)
         part["trouble"] = part["trouble"] or problem
         if part_run is not None:
             write_report(part_run.folder)
@@ -49,11 +49,11 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     return render(TEMPLATE, run, parts=parts, limits=run.suite.get("limits", [])), tables
 
 
-def _about(part: Mapping[str, Any]) -> dict[str, Any]:
+def _describe_part(part: Mapping[str, Any]) -> dict[str, Any]:
     return {"question": part.get("question", ""), "limits": part.get("limits", "")}
 
 
-def _read(folder: Path) -> tuple[Run | None, str]:
+def _read_run(folder: Path) -> tuple[Run | None, str]:
     """Return the run of a part, or None and why it cannot be read."""
     try:
         return load_run(folder), ""

@@ -16,8 +16,8 @@ from ssad.core.boxes import TrackedBoxes
 from ssad.core.columns import concatenate
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera, Frame, SceneContext, camera_to_world
-from ssad.core.images import captioned, read_image, save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.images import add_caption, read_image, save_picture
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.scenarios.static.shifts import SEVERITIES, SHIFTS, Calibration, ShiftSpec, shift_images, viewing_direction
@@ -59,7 +59,7 @@ def box_at(camera: Camera, rectangle: Sequence[float]) -> TrackedBoxes:
     return TrackedBoxes(centre[None, :3], size_lwh, rotation, velocity, (f"box {x0:g},{y0:g}",), np.ones(1))
 
 
-def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
+def assumed_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
     """Return the assumed frame of a user's image [H, W, 3]."""
     camera = Camera.typical(image.shape[1], image.shape[0])
     boxes_list = [box_at(camera, rectangle) for rectangle in rectangles]
@@ -92,7 +92,7 @@ def pick_frame(
     if not frames:
         channels = sorted({candidate.channel for candidate in scene_data.frames if candidate.modality == "camera"})
         raise ConfigError(f"{data.root}: no camera {channel}; there are: {', '.join(channels)}")
-    best_frame = max(frames, key=lambda candidate: _in_view(shifter.camera_frame(candidate)))
+    best_frame = max(frames, key=lambda candidate: _total_box_height(shifter.camera_frame(candidate)))
     fog_shifter = SceneShifter(data.root, scene_data, ShiftSpec("fog", 3))
     camera_view = shifter.camera_frame(best_frame)
     lidar_frame, image = fog_shifter.camera_frame(best_frame), shifter.read(best_frame)
@@ -102,7 +102,7 @@ def pick_frame(
     return image, replace(camera_view, points=lidar_frame.points, depth=lidar_frame.depth), context
 
 
-def _in_view(frame: Frame) -> float:
+def _total_box_height(frame: Frame) -> float:
     """Return the sum of the apparent heights of the boxes, in pixels, at most 300 each."""
     world_to_camera = np.linalg.inv(camera_to_world(frame))
     centres = frame.boxes.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
@@ -130,10 +130,10 @@ def contact_sheet(
     width: int = 480,
 ) -> U8:
     """The clean picture and the shifts in three columns, as in the paper's figure of all 11: [rows, columns, 3]."""
-    panels = [captioned(image, "clean", width)]
+    panels = [add_caption(image, "clean", width)]
     for name in shifts:
         spec = ShiftSpec(name, severity, seed, calibration)
-        panels.append(captioned(*_shifted(image, frame, spec, context), width))
+        panels.append(add_caption(*_shift_with_caption(image, frame, spec, context), width))
     panels += [np.full_like(panels[0], 255)] * (-len(panels) % 3)
     return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
@@ -152,15 +152,15 @@ def severity_sheet(
     rows = []
     for name in shifts:
         specs = [ShiftSpec(name, severity, seed, calibration) for severity in SEVERITIES]
-        cells = [_shifted(image, frame, spec, context) for spec in specs]
+        cells = [_shift_with_caption(image, frame, spec, context) for spec in specs]
         captioned_cells = [
             (panel, text or f"{name} {spec.severity}") for (panel, text), spec in zip(cells, specs, strict=True)
         ]
-        rows.append(np.hstack([captioned(panel, text, width) for panel, text in captioned_cells]))
+        rows.append(np.hstack([add_caption(panel, text, width) for panel, text in captioned_cells]))
     return np.vstack(rows)
 
 
-def _shifted(image: U8, frame: Frame, spec: ShiftSpec, context: SceneContext | None) -> tuple[U8, str]:
+def _shift_with_caption(image: U8, frame: Frame, spec: ShiftSpec, context: SceneContext | None) -> tuple[U8, str]:
     """Return a shifted image and its caption, which states why a shift was not applied."""
     contexts = {context.scene: context} if context is not None else None
     shifted_image, applied = shift_images(image, frame, spec, contexts=contexts)
@@ -185,13 +185,13 @@ def write_sheets(
     shifts: Sequence[str] = tuple(SHIFTS),
 ) -> tuple[Path, Path]:
     """Both sheets of a picture or of a nuScenes folder: OUT, and beside it OUT with "-severities" in its name."""
-    quiet_warp()
+    start_warp_quietly()
     context: SceneContext | None = None
     if source.is_dir():
         image, frame, context = pick_frame(NuScenes(source, version), channel=channel, scene=scene, seed=seed)
     else:
         image = read_image(source)
-        frame = own_frame(image, boxes)
+        frame = assumed_frame(image, boxes)
     severities_path = out.with_name(f"{out.stem}-severities{out.suffix}")
     sheet = contact_sheet(
         image, frame, context=context, severity=severity, seed=seed, calibration=calibration, shifts=shifts

@@ -19,7 +19,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, SSADError, StoreError
 from ssad.core.frames import Camera, Frame
 from ssad.core.images import encode_jpeg, read_image
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import dump_json, make_folder, read_text, remove_unfinished, write_atomic
 from ssad.core.types import U8
 from ssad.engine.pool import open_pool
@@ -71,7 +71,7 @@ def picture_shifts(names: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class ShiftedImage:
+class ShiftTask:
     """One picture under one shift: the unit of work of a worker.
 
     Attributes:
@@ -141,7 +141,7 @@ def shift_pictures(
         out, {"identity": identity, "suite": {"name": "ssad shift", **identity}}, retry=True, command="ssad shift"
     ) as store:
         tasks = [
-            _picture(path, source, root, condition=condition, settings=settings)
+            _make_task(path, source, root, condition=condition, settings=settings)
             for root, condition in conditions.items()
             for path in pictures
         ]
@@ -150,31 +150,31 @@ def shift_pictures(
         missing = [
             picture
             for picture in tasks
-            if _name(picture) not in store.results or not (picture.root / picture.key).is_file()
+            if _task_name(picture) not in store.results or not (picture.root / picture.key).is_file()
         ]
         with open_pool(len(missing), workers=workers, ray=ray) as pool:
             for picture in missing:
-                pool.add(Task(_written, picture, PICTURE_S, label=picture))
+                pool.add(Task(_shift_image, picture, PICTURE_S, label=picture))
             for finished, outcome in enumerate(pool.outcomes(), 1):
                 picture = outcome.task.label
                 record = outcome.value or {"status": outcome.status, "reason": outcome.reason}
-                if _name(picture) not in store.results:  # else only the file was missing, and its record stands
-                    store.append({"key": _name(picture), **record}, None)
+                if _task_name(picture) not in store.results:  # else only the file was missing, and its record stands
+                    store.append({"key": _task_name(picture), **record}, None)
                 progress(len(tasks) - len(missing) + finished, len(tasks))
         return [
-            _ended(root, source, files, settings=identity, condition=condition, results=store.results)
+            _finish_folder(root, source, files, settings=identity, condition=condition, results=store.results)
             for root, condition in conditions.items()
         ]
 
 
-def _picture(
+def _make_task(
     path: Path, source: Path, root: Path, *, condition: tuple[str, Strength], settings: Mapping[str, Any]
-) -> ShiftedImage:
+) -> ShiftTask:
     shift, strength = condition
     spec = ShiftSpec(
         shift, 1 if strength == "random" else int(strength), seed=settings["seed"], calibration=settings["calibration"]
     )
-    return ShiftedImage(
+    return ShiftTask(
         path,
         path.relative_to(source).as_posix(),
         root.absolute(),
@@ -185,24 +185,24 @@ def _picture(
     )
 
 
-def _name(image: ShiftedImage) -> str:
+def _task_name(image: ShiftTask) -> str:
     return f"{image.root.name}/{image.key}"
 
 
-def _written(image_task: ShiftedImage) -> dict[str, Any]:
+def _shift_image(image_task: ShiftTask) -> dict[str, Any]:
     """In a worker: shift one picture; what is recorded of it."""
     spec = (
         replace(image_task.spec, severity=random_severity(image_task.spec, image_task.key, image_task.key))
         if image_task.random
         else image_task.spec
     )
-    quiet_warp()
+    start_warp_quietly()
     try:
         image = read_image(image_task.path)
         frame = Frame(camera_of(image_task.path, image), scene=image_task.key, sample=image_task.key)
         shifted, (application,) = shift_images(image, [frame], spec)
         make_folder((image_task.root / image_task.key).parent)
-        write_atomic(image_task.root / image_task.key, _encoded(shifted, image_task))
+        write_atomic(image_task.root / image_task.key, _encode_shifted(shifted, image_task))
     except SSADError as error:
         return {"status": "failed", "severity": spec.severity, "reason": str(error)}
     details = {
@@ -213,7 +213,7 @@ def _written(image_task: ShiftedImage) -> dict[str, Any]:
     return {"status": "ok", "severity": spec.severity, **details}
 
 
-def _encoded(image: U8, image_task: ShiftedImage) -> bytes:
+def _encode_shifted(image: U8, image_task: ShiftTask) -> bytes:
     if image_task.path.suffix.lower() not in JPEG:
         return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
     chroma = image_task.subsampling
@@ -244,7 +244,7 @@ def camera_of(path: Path, image: U8) -> Camera:
     raise ConfigError(f"{calibration}: no line '{matrix_name}:' with 12 numbers")
 
 
-def _ended(
+def _finish_folder(
     root: Path,
     source: Path,
     files: Sequence[Path],

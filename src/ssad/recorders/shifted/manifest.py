@@ -42,12 +42,12 @@ def read_lines(path: Path) -> dict[str, dict[str, Any]]:
             record = safeio.parse_json(line.decode(), str(path)) if line else None
         except (FormatError, UnicodeDecodeError):
             continue  # truncated by a kill: the file is made again
-        if _whole(record):
+        if _is_complete(record):
             records[record["file"]] = record
     return records
 
 
-def _whole(record: Any) -> TypeGuard[dict[str, Any]]:
+def _is_complete(record: Any) -> TypeGuard[dict[str, Any]]:
     """Return whether a line has all the fields that the toolbox reads."""
     if not isinstance(record, dict) or record.get("state") not in STATES:
         return False
@@ -57,7 +57,7 @@ def _whole(record: Any) -> TypeGuard[dict[str, Any]]:
     return size_valid and all(isinstance(record.get(field_name), str) for field_name in text_fields)
 
 
-def text(records: Iterable[Mapping[str, Any]]) -> str:
+def serialise_lines(records: Iterable[Mapping[str, Any]]) -> str:
     """Serialise lines sorted by file name: the text does not depend on the order in which files were made."""
     return "".join(
         safeio.dump_json(dict(record)) + "\n" for record in sorted(records, key=lambda record: str(record["file"]))
@@ -95,7 +95,7 @@ class ManifestCounts:
     def add(self, scene: str, records: Iterable[Mapping[str, Any]]) -> None:
         """Add the lines of a scene."""
         rows = list(records)
-        self.scenes[scene] = digest_bytes(text(rows).encode())
+        self.scenes[scene] = digest_bytes(serialise_lines(rows).encode())
         for record in rows:
             self.files[f"{record['kind']} {record['state']}"] += 1
             self.states[record["state"]] += 1
@@ -109,7 +109,7 @@ class ManifestCounts:
                 self.skipped[record["reason"]] += 1
 
     @property
-    def applied(self) -> float:
+    def applied_share(self) -> float:
         """Share of the images that changed."""
         return self.changed / max(self.images, 1)
 
@@ -126,7 +126,7 @@ def page(
         "scenes": dict(sorted(tally.scenes.items())),
         "files": dict(sorted(tally.files.items())),
         "images": tally.images,
-        "applied": tally.applied,
+        "applied": tally.applied_share,
         "skipped": dict(sorted(tally.skipped.items())),
     }
 
@@ -185,15 +185,15 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
         raise StoreError(
             f"{root}: these scenes are not shifted: {', '.join(missing[:3])}{remainder}; run ssad shift for them"
         )
-    for box_problem in _wrong_boxes(root, manifest):
+    for box_problem in _find_box_problems(root, manifest):
         raise StoreError(f"{box_problem}; run the same ssad shift again")
     selected: list[tuple[str, str, str]] = []
     for scene in scene_names or manifest["scenes"]:
         records = read_lines(shard_path(root, scene))
-        if digest_bytes(text(records.values()).encode()) != manifest["scenes"][scene]:
+        if digest_bytes(serialise_lines(records.values()).encode()) != manifest["scenes"][scene]:
             raise StoreError(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of; run ssad shift again")
         for record in records.values():
-            problem = _wrong(root, record, manifest)
+            problem = _find_problem(root, record, manifest)
             if problem:
                 raise StoreError(f"{root / record['file']}: {problem}; run the same ssad shift again")
         shifted = ((entry["file"], entry["hash"]) for entry in records.values() if entry["state"] == "shifted")
@@ -205,7 +205,7 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
     return manifest
 
 
-def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -> str | None:
+def _find_problem(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -> str | None:
     """Return the problem of a file, judged by its name, size and link alone; None if there is none."""
     path = root / record["file"]
     if record["state"] == "failed":
@@ -214,7 +214,7 @@ def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -
         return "there, where the dataset has none" if path.is_symlink() or path.exists() else None
     if record["state"] == "linked":
         return (
-            None if leads_to(path, Path(manifest["source"]["root"]) / record["file"]) else "no link to the clean file"
+            None if is_link_to(path, Path(manifest["source"]["root"]) / record["file"]) else "no link to the clean file"
         )
     if path.is_symlink():
         return "a link, where the manifest says that it was shifted"
@@ -224,7 +224,7 @@ def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -
     return None if size == record["bytes"] else f"{size} bytes, {record['bytes']} in the manifest"
 
 
-def leads_to(link: Path, source: Path) -> bool:
+def is_link_to(link: Path, source: Path) -> bool:
     """Return whether `link` is a symbolic link to `source`, and `source` exists."""
     try:
         return link.is_symlink() and os.path.samefile(link, source)
@@ -232,13 +232,13 @@ def leads_to(link: Path, source: Path) -> bool:
         return False
 
 
-def _wrong_boxes(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+def _find_box_problems(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
     """Yield a problem unless sample_annotation.json is the set of boxes that the summary names."""
     version = manifest["source"]["version"]
     path = root / version / f"{TABLE}.json"
     is_transformed = manifest["labels"] == "transformed"
     transformed_path = root / version / f"{TABLE}.transformed.json"
-    if not leads_to(
+    if not is_link_to(
         path, transformed_path if is_transformed else Path(manifest["source"]["root"]) / version / f"{TABLE}.json"
     ):
         yield f"{path}: no link to the {manifest['labels']} boxes, which {PAGE} names"
@@ -258,7 +258,7 @@ def verify(root: Path) -> tuple[int, list[str]]:
     manifest = read_manifest(root)
     if manifest is None:
         raise StoreError(f"{root}: not written by ssad shift (no {PAGE})")
-    file_count, problems = 0, list(_wrong_boxes(root, manifest))
+    file_count, problems = 0, list(_find_box_problems(root, manifest))
     version = manifest["source"]["version"]
     table_hashes = {
         table_name: text for table_name, text in manifest["source"]["tables"].items() if table_name != TABLE
@@ -266,22 +266,22 @@ def verify(root: Path) -> tuple[int, list[str]]:
     table_hashes |= {f"{TABLE}.original": manifest["source"]["tables"].get(TABLE)}
     table_hashes |= {f"{TABLE}.transformed": manifest["transformed"]}
     for table_name, expected_hash in sorted(table_hashes.items()):
-        problems += _wrong_bytes(root / version / f"{table_name}.json", expected_hash)
+        problems += _find_byte_problems(root / version / f"{table_name}.json", expected_hash)
     for scene, expected_hash in manifest["scenes"].items():
         records = read_lines(shard_path(root, scene))
-        if digest_bytes(text(records.values()).encode()) != expected_hash:
+        if digest_bytes(serialise_lines(records.values()).encode()) != expected_hash:
             problems.append(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of")
         for record in records.values():
             file_count += 1
-            problem = _wrong(root, record, manifest)
+            problem = _find_problem(root, record, manifest)
             if problem:
                 problems.append(f"{root / record['file']}: {problem}")
             elif record["state"] == "shifted":
-                problems += _wrong_bytes(root / record["file"], record["hash"])
+                problems += _find_byte_problems(root / record["file"], record["hash"])
     return file_count, problems
 
 
-def _wrong_bytes(path: Path, expected_hash: str) -> list[str]:
+def _find_byte_problems(path: Path, expected_hash: str) -> list[str]:
     """Return one line if a file has another hash or cannot be read."""
     try:
         return [] if digest_file(path) == expected_hash else [f"{path}: not the bytes in the manifest"]

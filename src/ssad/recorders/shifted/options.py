@@ -112,7 +112,7 @@ class Shard:
         return self.options.root(self.shift, self.severity)
 
     @property
-    def random(self) -> bool:
+    def is_random(self) -> bool:
         """True if the severity is drawn at random."""
         return self.severity == "random"
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
-from ssad.core.frames import Applied
+from ssad.core.frames import ShiftReport
 from ssad.core.images import encode_jpeg
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import LIDAR
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.files import points_bytes
@@ -29,10 +29,10 @@ from ssad.recorders.shifted.manifest import (
     STATES,
     digest_bytes,
     digest_file,
-    leads_to,
+    is_link_to,
     read_lines,
+    serialise_lines,
     shard_path,
-    text,
 )
 from ssad.recorders.shifted.options import Shard
 from ssad.scenarios.static.shifts.scene_shifter import SceneShifter
@@ -58,7 +58,7 @@ def labels_path(root: Path, scene: str) -> Path:
     return root / FOLDER / f"{scene}.labels.json"
 
 
-def finished(root: Path, scene: str) -> SceneLabels | None:
+def read_finished_labels(root: Path, scene: str) -> SceneLabels | None:
     """Return the boxes of a scene all of whose files were made; None for an unfinished scene."""
     try:
         encoded = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
@@ -84,9 +84,9 @@ def make_shard(shard: Shard) -> dict[str, int]:
     threads = cv2.getNumThreads()
     # Each worker has one core: threads of OpenCV would only compete with other workers.
     cv2.setNumThreads(1)
-    quiet_warp()
+    start_warp_quietly()
     try:
-        records = _files(shard)
+        records = _make_files(shard)
     finally:
         cv2.setNumThreads(threads)
     return {state: sum(record["state"] == state for record in records.values()) for state in STATES}
@@ -104,33 +104,33 @@ def _open(shard: Shard) -> NuScenes:
     return _DATA[key]
 
 
-def _files(shard: Shard) -> dict[str, dict[str, Any]]:
+def _make_files(shard: Shard) -> dict[str, dict[str, Any]]:
     scene = _open(shard).scene(shard.scene)
-    shifter = SceneShifter(shard.options.source, scene, shard.spec(), random=shard.random)
+    shifter = SceneShifter(shard.options.source, scene, shard.spec(), random=shard.is_random)
     lines_path, labels_file = shard_path(shard.root, shard.scene), labels_path(shard.root, shard.scene)
     previous_records = read_lines(lines_path)
     records: dict[str, dict[str, Any]] = {}
     for frame in scene.frames:
         previous = previous_records.get(frame.filename)
-        if previous is not None and _stands(shard, previous) and not shifter.outdated(frame, previous):
+        if previous is not None and _is_intact(shard, previous) and not shifter.is_outdated(frame, previous):
             records[frame.filename] = previous
     if len(records) == len({other_frame.filename for other_frame in scene.frames}):
-        scene_labels = finished(shard.root, shard.scene)
-        if scene_labels is not None and scene_labels.lines == digest_bytes(text(records.values()).encode()):
+        scene_labels = read_finished_labels(shard.root, shard.scene)
+        if scene_labels is not None and scene_labels.lines == digest_bytes(serialise_lines(records.values()).encode()):
             return records
     # The labels mark a finished scene, so they must go before any file changes.
     _remove(labels_file)
     check_folders(shard.root, {Path(other_frame.filename).parent for other_frame in scene.frames}, shard.options.source)
     safeio.make_folder(lines_path.parent)
-    with _appending(lines_path) as lines_file:
+    with _open_for_append(lines_path) as lines_file:
         for frame in scene.frames:
             if frame.filename not in records:
-                record = records[frame.filename] = _make(shard, shifter, frame)
+                record = records[frame.filename] = _make_file(shard, shifter, frame)
                 _append(lines_path, lines_file, record)
     boxes = {}
     for sample in scene.samples:
         boxes.update(_boxes(shard, shifter, sample.token, records))
-    manifest_text = text(records.values())
+    manifest_text = serialise_lines(records.values())
     safeio.write_atomic(lines_path, manifest_text)
     content = {"lines": digest_bytes(manifest_text.encode()), "boxes": boxes}
     safeio.write_atomic(labels_file, safeio.dump_json(content) + "\n")
@@ -146,12 +146,12 @@ def check_folders(root: Path, folders: Iterable[str | Path], source: Path) -> No
 
 
 @contextlib.contextmanager
-def _appending(path: Path) -> Iterator[RawIOBase]:
+def _open_for_append(path: Path) -> Iterator[RawIOBase]:
     """Open a file to append whole lines; it is on disk when the block ends."""
     try:
         stream = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
     except OSError as error:
-        raise _cannot(path, error) from None
+        raise _write_error(path, error) from None
     with stream:
         if stream.tell():
             _append(path, stream, None)  # ends a line that a kill may have truncated
@@ -159,7 +159,7 @@ def _appending(path: Path) -> Iterator[RawIOBase]:
         try:
             os.fsync(stream.fileno())
         except OSError as error:
-            raise _cannot(path, error) from None
+            raise _write_error(path, error) from None
 
 
 def _append(path: Path, file: RawIOBase, record: Mapping[str, Any] | None) -> None:
@@ -168,18 +168,18 @@ def _append(path: Path, file: RawIOBase, record: Mapping[str, Any] | None) -> No
         while remaining:
             remaining = remaining[file.write(remaining) :]
     except OSError as error:
-        raise _cannot(path, error) from None
+        raise _write_error(path, error) from None
 
 
-def _cannot(path: Path, error: OSError) -> StoreError:
+def _write_error(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path}: cannot be written: {error.strerror or error}; mend that and run the same command again")
 
 
-def _stands(shard: Shard, record: Mapping[str, Any]) -> bool:
+def _is_intact(shard: Shard, record: Mapping[str, Any]) -> bool:
     """Return whether a file matches its manifest line."""
     path, source = shard.root / str(record["file"]), shard.options.source / str(record["file"])
     if record["state"] == "linked":
-        return leads_to(path, source)
+        return is_link_to(path, source)
     if record["state"] == "absent":
         return not path.is_symlink() and not path.exists() and not source.exists()
     if record["state"] == "failed" or path.is_symlink() or not path.is_file():
@@ -187,7 +187,7 @@ def _stands(shard: Shard, record: Mapping[str, Any]) -> bool:
     return bool(path.stat().st_size == record["bytes"] and digest_file(path) == record["hash"])
 
 
-def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, Any]:
+def _make_file(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, Any]:
     """Make one file, shifted or linked, and return its manifest line."""
     kind = "camera" if frame.modality == "camera" else "lidar" if frame.channel == LIDAR else frame.modality
     record: dict[str, Any] = {"file": frame.filename, "kind": kind, "token": frame.token}
@@ -198,10 +198,10 @@ def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, 
     try:
         encoded, pixels, applied = (_image if kind == "camera" else _points)(shard, shifter, frame)
     except FormatError as error:
-        return _failed(shard, record, str(error))
+        return _failed_line(shard, record, str(error))
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         message = f"{frame.filename}: its boxes, pose or calibration make no picture: {error}"
-        return _failed(shard, record, message)
+        return _failed_line(shard, record, message)
     application = {"applied": applied.applied, "details": dict(applied.details), "skipped": dict(applied.skipped)}
     record |= {
         "severity": shifter.spec(frame).severity,
@@ -210,19 +210,19 @@ def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, 
         **shifter.basis(frame),
     }
     if encoded is None:
-        return _link(shard, record if applied.skipped else record | {"reason": _idle(shifter, frame)})
+        return _link(shard, record if applied.skipped else record | {"reason": _unchanged_reason(shifter, frame)})
     _write(shard.root, shard.root / frame.filename, encoded)
     return record | {"state": "shifted", "pixels": pixels, "hash": digest_bytes(encoded), "bytes": len(encoded)}
 
 
-def _idle(shifter: SceneShifter, frame: SensorFrame) -> str:
+def _unchanged_reason(shifter: SceneShifter, frame: SensorFrame) -> str:
     """Return the reason why a file did not change, for shifts that state none."""
     if shifter.spec(frame).severity == 0:
         return "severity 0 changes nothing"
     return "no object in it" if shifter.base.family == "object" else "the shift changed nothing in it"
 
 
-def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
+def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
     clean_image = shifter.read(frame)
     image, applied = shifter.image(frame, clean=clean_image)
@@ -232,7 +232,7 @@ def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[byt
     return _encode(image, shard, frame.filename), digest_bytes(image.data), applied
 
 
-def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
+def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted sweep (None: unchanged), their hash, and the application of the shift."""
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):
@@ -250,7 +250,7 @@ def _boxes(shard: Shard, shifter: SceneShifter, sample: str, records: dict[str, 
     except FormatError as error:  # it was linked without being read
         assert sweep is not None
         identity = {name: records[sweep.filename][name] for name in ("file", "kind", "token")}
-        records[sweep.filename] = _failed(shard, identity, str(error))
+        records[sweep.filename] = _failed_line(shard, identity, str(error))
         labels = shifter.labels(sample, lidar=None)
     sizes = labels.size_wlh
     return {
@@ -264,7 +264,7 @@ def _boxes(shard: Shard, shifter: SceneShifter, sample: str, records: dict[str, 
     }
 
 
-def _failed(shard: Shard, record: dict[str, Any], message: str) -> dict[str, Any]:
+def _failed_line(shard: Shard, record: dict[str, Any], message: str) -> dict[str, Any]:
     """Return the manifest line of a file that cannot be made, and remove any older version of it."""
     _remove(shard.root / record["file"])
     return record | {"state": "failed", "reason": message.replace(f"{shard.options.source}{os.sep}", "")}
@@ -287,7 +287,7 @@ def _link(shard: Shard, record: dict[str, Any], *, is_required: bool = True) -> 
     source = shard.options.source / record["file"]
     if not os.path.isfile(source):
         if is_required or os.path.lexists(source):
-            return _failed(shard, record, f"{record['file']}: no such file")
+            return _failed_line(shard, record, f"{record['file']}: no such file")
         _remove(shard.root / record["file"])
         return record | {"state": "absent"}
     link(shard.root, source, shard.root / record["file"])
@@ -317,19 +317,19 @@ def link(root: Path, source: Path, target: Path) -> None:
         if os.path.islink(target) and os.readlink(target) == destination:
             return
     except OSError as error:
-        raise _cannot(target, error) from None
-    with _replacing(root, target) as temporary:
+        raise _write_error(target, error) from None
+    with _replacement_path(root, target) as temporary:
         temporary.symlink_to(destination)
 
 
 def _write(root: Path, target: Path, data: bytes) -> None:
     """Write a whole file or nothing. Files are not synced: their size and hash are in the manifest, which is."""
-    with _replacing(root, target) as temporary:
+    with _replacement_path(root, target) as temporary:
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
-def _replacing(root: Path, target: Path) -> Iterator[Path]:
+def _replacement_path(root: Path, target: Path) -> Iterator[Path]:
     """Yield a path in the folder of unfinished files that replaces `target` if the block succeeds. StoreError."""
     temporary = _temporary(root)
     try:
@@ -339,7 +339,7 @@ def _replacing(root: Path, target: Path) -> Iterator[Path]:
         # A rename within one file system is atomic: a kill leaves either the old file or the new one.
         os.replace(temporary, target)
     except OSError as error:
-        raise _cannot(target, error) from None
+        raise _write_error(target, error) from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -349,4 +349,4 @@ def _remove(target: Path) -> None:
     try:
         target.unlink(missing_ok=True)
     except OSError as error:
-        raise _cannot(target, error) from None
+        raise _write_error(target, error) from None

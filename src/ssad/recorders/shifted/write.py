@@ -29,14 +29,14 @@ from ssad.recorders.shifted.manifest import (
     shard_path,
 )
 from ssad.recorders.shifted.options import Options, Shard, Strength
-from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
+from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, link, make_shard, read_finished_labels
 from ssad.scenarios.static.shifts.sun import NO_SUN
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class ShiftedRoot:
     """State of a written nuScenes root; with failed files it has no manifest.json and is incomplete.
 
     Attributes:
@@ -56,9 +56,9 @@ class Written:
     reasons: tuple[str, ...]
 
 
-def materialise(
+def write_shifted_roots(
     options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress = lambda done, of: None
-) -> list[Written]:
+) -> list[ShiftedRoot]:
     """Write one nuScenes root for each shift and severity; a repeated run resumes and keeps existing files.
 
     The bytes depend neither on the number of workers nor on the cluster.
@@ -95,7 +95,7 @@ def materialise(
     source = {"root": str(options.source.resolve()), "version": options.version, "tables": _tables(options)}
     with locked(options.out, "ssad shift"):
         for shift, severity in conditions:
-            _begin(options, shift, severity, source)
+            _open_root(options, shift, severity, source)
         shards = options.absolute().shards(scene_names)
         run_all(
             open_pool(len(shards), workers=workers, ray=ray),
@@ -108,7 +108,7 @@ def materialise(
         for shift, severity in conditions:
             try:
                 written_roots.append(
-                    _finish(options, shift, severity, source=source, scenes=scene_names, scene_names=all_scenes)
+                    _finish_root(options, shift, severity, source=source, scenes=scene_names, scene_names=all_scenes)
                 )
             except StoreError as error:  # finish the other roots nevertheless
                 errors.append(error)
@@ -122,7 +122,7 @@ def _tables(options: Options) -> dict[str, str]:
     return {name: digest_file(table_path(options.source, options.version, name)) for name in sorted(TABLES)}
 
 
-def _begin(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
+def _open_root(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
     """Create a root, or resume one with the same identity. StoreError for a root of another identity."""
     root = options.root(shift, severity)
     check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
@@ -153,7 +153,7 @@ def _clear(root: Path, version: str) -> None:
         safeio.remove_unfinished(folder)
 
 
-def _finish(
+def _finish_root(
     options: Options,
     shift: str,
     severity: Strength,
@@ -161,7 +161,7 @@ def _finish(
     source: dict[str, Any],
     scenes: Sequence[str],
     scene_names: Sequence[str],
-) -> Written:
+) -> ShiftedRoot:
     """Labels, the manifest's page, and the check that something changed.
 
     The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
@@ -169,7 +169,7 @@ def _finish(
     root = options.root(shift, severity)
     counts, scene_boxes = ManifestCounts(), dict[str, msgspec.Raw]()
     for scene in scene_names:
-        scene_labels = finished(root, scene)
+        scene_labels = read_finished_labels(root, scene)
         if scene_labels is None and scene in scenes:
             raise StoreError(f"{root}: the lines of {scene} are gone; run the same ssad shift again")
         records = read_lines(shard_path(root, scene)).values() if scene_labels is not None else ()
@@ -190,8 +190,8 @@ def _finish(
         manifest = page(identity, source, counts, labels=options.labels, transformed=transformed)
         safeio.write_atomic(root / PAGE, safeio.dump_json(manifest, indent=1) + "\n")
     states = counts.states
-    return Written(
-        root, states["shifted"], states["linked"], states["failed"], counts.applied, tuple(sorted(counts.reasons))
+    return ShiftedRoot(
+        root, states["shifted"], states["linked"], states["failed"], counts.applied_share, tuple(sorted(counts.reasons))
     )
 
 

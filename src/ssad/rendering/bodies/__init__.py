@@ -195,7 +195,7 @@ BODIES: dict[str, Body] = {
         },
     ),
     "overturned": Body(
-        anomalies.overturned,
+        anomalies.overturned_vehicle,
         {
             "car_side": BodyStyle((4.75, 1.47, 1.93), 0.035, 2.0),
             "suv_side": BodyStyle((4.70, 1.76, 2.00), 0.04),

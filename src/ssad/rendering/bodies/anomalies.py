@@ -110,11 +110,11 @@ def _boxes(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
         if detail == 2:  # the flaps of the lid are slightly open
             pieces += [
                 box((1.9 * x, 0.9 * y, 0.006), material=carton)
-                .transformed(_turned("x", side * 0.25))
+                .transformed(_axis_rotation("x", side * 0.25))
                 .moved(0.0, side * 0.5 * y, 2.0 * z - 0.01)
                 for side in (-1.0, 1.0)
             ]
-        box_mesh = merge(pieces).transformed(_turned("z", yaw))
+        box_mesh = merge(pieces).transformed(_axis_rotation("z", yaw))
         parts.append(box_mesh.moved(position[0] * length, position[1] * width, position[2] * height))
     return finish(parts, [], size)
 
@@ -177,7 +177,7 @@ def _ladder(size: Point, detail: int) -> Mesh:
 def _branch(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
     """Return a limb with twigs and some leaves."""
     length, width, height = size
-    leaf_materials = _greens(generator)
+    leaf_materials = _draw_greens(generator)
     bend_offsets = generator.uniform(-1.0, 1.0, (6, 2))
     positions = np.linspace(-0.5, 0.5, 6)
     radius = 0.04 + 0.01 * length
@@ -216,7 +216,7 @@ def _branch(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
 def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
     """Return a fallen tree that fills its size, m: it lies along x, its root plate behind, its crown ahead."""
     length, width, height = size
-    leaf_materials = _greens(generator)
+    leaf_materials = _draw_greens(generator)
     radius = 0.025 * length + 0.04
     is_bare = style == "bare"
     segment_count = (5, 7, 10)[detail]
@@ -249,8 +249,11 @@ def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, deta
         start = spine[2] + (0.15 + 0.8 * trunk_share) * (spine[4] - spine[2])
         bough_angle = np.pi * (bough_index % 6 + turn_share) / 6.0  # from one side over the top to the other
         span_share = 0.55 + 0.45 * length_share
-        rise, aside = 0.85 * height * span_share * np.sin(bough_angle), 0.46 * width * span_share * np.cos(bough_angle)
-        end = start + np.array([0.18 * length * (0.4 + length_share), aside, rise])
+        rise, lateral = (
+            0.85 * height * span_share * np.sin(bough_angle),
+            0.46 * width * span_share * np.cos(bough_angle),
+        )
+        end = start + np.array([0.18 * length * (0.4 + length_share), lateral, rise])
         end[2] = min(end[2], 0.9 * height)
         path = np.stack([start, 0.5 * (start + end) + [0.0, 0.0, 0.04 * height], end])
         parts.append(
@@ -272,7 +275,7 @@ def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, deta
     return finish(parts, [], size)
 
 
-def _greens(generator: np.random.Generator) -> tuple[Material, Material, Material]:
+def _draw_greens(generator: np.random.Generator) -> tuple[Material, Material, Material]:
     """Draw two greens of leaves and the dark material inside a crown."""
     hue_share, brightness = generator.uniform(0.0, 1.0), generator.uniform(0.8, 1.2)
     base = brightness * (np.array([0.055, 0.105, 0.025]) + hue_share * np.array([0.055, 0.02, 0.0]))
@@ -338,7 +341,7 @@ def foliage(
 
 
 @dataclass(frozen=True, slots=True)
-class _Beast:
+class _AnimalShape:
     """Shape and coats of an animal.
 
     Attributes:
@@ -350,7 +353,7 @@ class _Beast:
         tail: Path as for the trunk.
         ear: x, z, length, width, m.
         narrow: Ratio of width to height of trunk and head.
-        apart: Distance of the legs from the plane of symmetry, m.
+        leg_spacing: Distance of the legs from the plane of symmetry, m.
         coats: Linear RGB of each.
     """
 
@@ -362,12 +365,12 @@ class _Beast:
     tail: Path
     ear: tuple[float, float, float, float]  # x, z, length, width
     narrow: float
-    apart: float
+    leg_spacing: float
     coats: tuple[Point, ...]
 
 
-BEASTS: Mapping[str, _Beast] = {
-    "dog": _Beast(
+BEASTS: Mapping[str, _AnimalShape] = {
+    "dog": _AnimalShape(
         trunk=(
             (-0.36, 0.50, 0.05),
             (-0.33, 0.50, 0.105),
@@ -389,10 +392,10 @@ BEASTS: Mapping[str, _Beast] = {
         tail=((-0.34, 0.54, 0.03), (-0.47, 0.60, 0.026), (-0.55, 0.70, 0.014)),
         ear=(0.35, 0.80, 0.10, 0.05),
         narrow=0.85,
-        apart=0.085,
+        leg_spacing=0.085,
         coats=((0.22, 0.12, 0.05), (0.03, 0.026, 0.022), (0.42, 0.29, 0.14), (0.10, 0.06, 0.035)),
     ),
-    "deer": _Beast(
+    "deer": _AnimalShape(
         trunk=(
             (-0.62, 0.90, 0.07),
             (-0.55, 0.90, 0.16),
@@ -414,10 +417,10 @@ BEASTS: Mapping[str, _Beast] = {
         tail=((-0.60, 0.95, 0.03), (-0.67, 0.88, 0.028), (-0.68, 0.80, 0.01)),
         ear=(0.52, 1.41, 0.15, 0.06),
         narrow=0.75,
-        apart=0.095,
+        leg_spacing=0.095,
         coats=((0.23, 0.125, 0.06), (0.28, 0.16, 0.08), (0.16, 0.10, 0.06)),
     ),
-    "cow": _Beast(
+    "cow": _AnimalShape(
         trunk=(
             (-0.92, 1.10, 0.10),
             (-0.86, 1.08, 0.25),
@@ -434,10 +437,10 @@ BEASTS: Mapping[str, _Beast] = {
         tail=((-0.92, 1.28, 0.03), (-1.0, 1.0, 0.022), (-0.99, 0.62, 0.025), (-0.98, 0.45, 0.045)),
         ear=(0.98, 1.35, 0.18, 0.09),
         narrow=0.9,
-        apart=0.20,
+        leg_spacing=0.20,
         coats=((0.60, 0.58, 0.54), (0.60, 0.58, 0.54), (0.20, 0.085, 0.035), (0.32, 0.20, 0.10)),
     ),
-    "horse": _Beast(
+    "horse": _AnimalShape(
         trunk=(
             (-0.85, 1.22, 0.10),
             (-0.78, 1.22, 0.25),
@@ -460,7 +463,7 @@ BEASTS: Mapping[str, _Beast] = {
         tail=((-0.84, 1.40, 0.05), (-0.98, 1.22, 0.08), (-1.0, 0.85, 0.085), (-0.98, 0.55, 0.04)),
         ear=(0.92, 1.97, 0.14, 0.05),
         narrow=0.8,
-        apart=0.15,
+        leg_spacing=0.15,
         coats=((0.12, 0.045, 0.02), (0.025, 0.02, 0.018), (0.22, 0.10, 0.04), (0.45, 0.43, 0.40)),
     ),
 }
@@ -505,7 +508,9 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
             path = [(x + side * swing_share * 0.35 * (leg_top - z), z, ring_radius) for x, z, ring_radius in leg]
             shoulder = (path[0][0], leg_top + 0.9 * path[0][2], 0.35 * path[0][2])
             path = _smooth_path([shoulder, *path], subdivision)
-            parts.append(_tapered_body(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.apart))
+            parts.append(
+                _tapered_body(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.leg_spacing)
+            )
             if style != "dog":
                 x, _, ring_radius = path[-1]
                 hoof = tube(
@@ -514,7 +519,7 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
                     material=HOOF,
                     segments=limb_segments,
                 )
-                parts.append(hoof.moved(y=side * shape.apart))
+                parts.append(hoof.moved(y=side * shape.leg_spacing))
     x, z, ear_length, ear_width = shape.ear
     ring_radius = shape.head[1][2]
     ear_spread = 0.75 if style in ("cow", "deer") else 0.35
@@ -534,7 +539,7 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
     return finish(parts, [], size)
 
 
-def _headgear(style: str, beast: _Beast, sides: int, *, antlers: bool, dark: Material) -> list[Mesh]:
+def _headgear(style: str, beast: _AnimalShape, sides: int, *, antlers: bool, dark: Material) -> list[Mesh]:
     """Horns and udder of a cow, antlers of a stag, mane of a horse."""
     x, z, _ = beast.head[0]
     if style == "cow":
@@ -610,7 +615,7 @@ def _paint_spots(mesh: Mesh, spots: F64, material: Material, *, upright: bool = 
 OVERTURNED_CARS = {"car_side": "sedan", "suv_side": "suv", "car_roof": "hatchback"}
 
 
-def overturned(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+def overturned_vehicle(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
     """Return a car or truck on its side or roof that fills its size, m; its panels are those of the vehicle."""
     length, width, height = size
     side = 1.0 if generator.random() < 0.5 else -1.0
@@ -623,7 +628,9 @@ def overturned(style: str, size: Point, *, generator: np.random.Generator, detai
     else:
         vehicle = car(OVERTURNED_CARS[style], upright_size, generator=generator, detail=detail)
         underside = _underside(upright_size, 0.17 * upright_size[2], truck=False)
-    lying_mesh = merge([vehicle, underside]).transformed(_turned("x", np.pi if is_on_roof else side * np.pi / 2.0))
+    lying_mesh = merge([vehicle, underside]).transformed(
+        _axis_rotation("x", np.pi if is_on_roof else side * np.pi / 2.0)
+    )
     return fit(_flatten_base(lying_mesh, 0.05 * height if is_on_roof else None), size)
 
 
@@ -675,7 +682,7 @@ def _underside(size: Point, top: float, *, truck: bool) -> Mesh:
     return merge(parts)
 
 
-def _turned(axis: str, angle: float) -> F64:
+def _axis_rotation(axis: str, angle: float) -> F64:
     """Return a rotation [3, 3] about x or z."""
     cosine, sine = np.cos(angle), np.sin(angle)
     if axis == "x":

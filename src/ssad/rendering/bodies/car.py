@@ -20,7 +20,7 @@ from ssad.rendering.bodies.parts import (
     finish,
     wheels,
 )
-from ssad.rendering.bodies.shell import B3, S3, S4, S5, U0, U2, Shell, axle_x, charts, end_x, sections, skin
+from ssad.rendering.bodies.shell import B3, S3, S4, S5, U0, U2, Shell, axle_x, charts, end_x, sections, shell_mesh
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, box, build, sphere
 
 _PLAN = ((0.0, 0.83), (0.02, 0.90), (0.06, 0.955), (0.18, 1.0), (0.80, 1.0), (0.94, 0.955), (0.98, 0.91), (1.0, 0.86))
@@ -218,7 +218,7 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int)
         tumble=style_shell.tumble * (1.0 + 0.06 * variation[2]),
         lamp_from=float(np.clip(style_shell.lamp_from + 0.05 * variation[3], 0.45, 0.75)),
     )
-    parts = [skin(shell, size, detail=detail)]
+    parts = [shell_mesh(shell, size, detail=detail)]
     radius = shell.radius * size[2]
     wheel_y = 0.5 * size[1] * shell.body - 0.012
     places = [(axle_x(shell, size, axle_share), wheel_y) for axle_share in shell.axles]

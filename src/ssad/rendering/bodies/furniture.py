@@ -395,7 +395,7 @@ def stop_sign(style: str, size: Point, *, generator: np.random.Generator, detail
     """
     _, width, height = size
     radius = 0.5 * width
-    red_material, white_material = _sheeting(generator, is_worn=style == "worn")
+    red_material, white_material = _draw_sheeting(generator, is_worn=style == "worn")
     octagon = _polygon(8, np.pi / 8, radius / np.cos(np.pi / 8))
     centre = np.array([0.0, height - radius])
     # 30 inches: a border of 0.75 and letters of 10 inches
@@ -414,7 +414,7 @@ def yield_sign(style: str, size: Point, *, generator: np.random.Generator, detai
     """Return a yield sign (R1-2 of the US) on a post, with the panels of `stop_sign`."""
     _, width, height = size
     half_width = 0.5 * width
-    red_material, white_material = _sheeting(generator, is_worn=style == "worn")
+    red_material, white_material = _draw_sheeting(generator, is_worn=style == "worn")
     triangle_height = np.sqrt(3.0) * half_width
     triangle = np.array(
         [(-half_width, 0.5 * triangle_height), (0.0, -0.5 * triangle_height), (half_width, 0.5 * triangle_height)]
@@ -430,7 +430,7 @@ def yield_sign(style: str, size: Point, *, generator: np.random.Generator, detai
     return finish(parts, _square_charts(half_width, height), size)
 
 
-def _sheeting(generator: np.random.Generator, *, is_worn: bool) -> tuple[Material, Material]:
+def _draw_sheeting(generator: np.random.Generator, *, is_worn: bool) -> tuple[Material, Material]:
     """Draw the red and white of a sign: new, or faded by the sun and dirty.
 
     The number of draws is always the same.

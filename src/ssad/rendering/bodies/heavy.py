@@ -32,7 +32,7 @@ from ssad.rendering.bodies.parts import (
     tubes,
     wheels,
 )
-from ssad.rendering.bodies.shell import S1, S2, S3, S4, Shell, axle_x, charts, skin
+from ssad.rendering.bodies.shell import S1, S2, S3, S4, Shell, axle_x, charts, shell_mesh
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, box, loft, merge, prism
 
 _BLUNT = ((0.0, 0.93), (0.03, 0.985), (0.08, 1.0), (0.95, 1.0), (1.0, 0.98))
@@ -108,7 +108,7 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
     shell = replace(CAB, radius=min(0.50, 0.19 * cab_height) / cab_height)
     radius = shell.radius * cab_height
     cab_shift = 0.5 * (length - cab_length)
-    parts = [skin(shell, cab_size, detail=detail).moved(cab_shift)]
+    parts = [shell_mesh(shell, cab_size, detail=detail).moved(cab_shift)]
     panels = [shift_chart(chart, cab_shift) for chart in charts(shell, cab_size)]
     rear_x, cargo_front, deck_height = -0.5 * length, 0.5 * length - cab_length - 0.08, 2.05 * radius
     parts.append(crate((rear_x + 0.05, -0.42, 0.75 * radius), (cargo_front + 0.4, 0.42, deck_height), FRAME))
@@ -319,7 +319,7 @@ def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int)
     )
     roof_share = 0.955 if style == "city" else 1.0
     body_size = (length, width, height * roof_share)
-    parts = [skin(shell, body_size, detail=detail)]
+    parts = [shell_mesh(shell, body_size, detail=detail)]
     parts += _bus_fittings(shell, body_size, detail, rear=True)
     if style == "city":
         parts.append(crate((-0.12 * length, -0.3 * width, 0.94 * height), (0.16 * length, 0.3 * width, height), CARGO))
@@ -398,7 +398,7 @@ def _bendy(size: Point, detail: int) -> Mesh:
     for shell, section_length, section_x, is_first in sections:
         section_size = (section_length, width, height)
         fittings = _bus_fittings(shell, section_size, detail, rear=not is_first, front=is_first)
-        parts += [part.moved(section_x) for part in (skin(shell, section_size, detail=detail), *fittings)]
+        parts += [part.moved(section_x) for part in (shell_mesh(shell, section_size, detail=detail), *fittings)]
         for chart in charts(shell, section_size):
             panel_name, *part_names = chart.name.split("/")
             if not is_first and panel_name == "front":

@@ -392,10 +392,10 @@ def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segme
     )
 
 
-def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, big: float) -> list[Mesh]:
+def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, size_share: float) -> list[Mesh]:
     x, y, z = (float(value) for value in pose.head)
     default_segments = (6, 8, 14)[detail]
-    scale = big * height
+    scale = size_share * height
 
     def ellipsoid(
         half_axes: Point, material: Material, ahead: float = 0.0, up: float = 0.0, segments: int = default_segments
@@ -489,7 +489,7 @@ def _cycle_extent(style: str, height: float, swing: float, spread: float) -> tup
     return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
 
 
-def _dress(appearance: PersonAppearance, style: str, share: float) -> PersonAppearance:
+def _dress_for_style(appearance: PersonAppearance, style: str, share: float) -> PersonAppearance:
     """The clothes that belong to a style; `share` in [0, 1) is drawn for the person."""
     if style == "elderly":
         shade = 0.30 + 0.35 * share
@@ -535,16 +535,16 @@ def pedestrian(
     every frame.
     """
     length, width, height = size
-    look = draw_appearance(generator)
+    appearance = draw_appearance(generator)
     random_phase, variation = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
-    look = _dress(look, style, variation)
+    appearance = _dress_for_style(appearance, style, variation)
     is_child, is_still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if is_still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))
 
     cycle_phase = 0.5 * np.pi if is_still else random_phase if phase is None else phase
     pose = _pose(style, height, cycle_phase, swing, spread)
-    body = figure(pose, look, height=height, detail=detail, child=is_child)
+    body = figure(pose, appearance, height=height, detail=detail, child=is_child)
     if style == "elderly":
         body = merge([body, tube(_stick(pose, height), 0.009 * height, material=STICK, segments=(3, 4, 6)[detail])])
     # The feet leave the ground at some phases of the cycle model: put the lowest point back on it.

@@ -187,7 +187,7 @@ def charts(shell: Shell, size: Point) -> list[Chart]:
     return panel_charts
 
 
-def skin(shell: Shell, size: Point, *, detail: int) -> Mesh:
+def shell_mesh(shell: Shell, size: Point, *, detail: int) -> Mesh:
     """Return the shell as one closed mesh with materials and panels; wheel arches are open at detail 1 and 2."""
     t = stations(shell, size, detail=detail)
     point_indices = POINTS[detail]
@@ -266,7 +266,7 @@ def _band_panel(shell: Shell, position: float, low: int, high: int, side: str) -
 
 
 def _flank(
-    shell: Shell, t: float, low: int, high: int, beside: tuple[Material, str | None]
+    shell: Shell, t: float, low: int, high: int, door: tuple[Material, str | None]
 ) -> tuple[Material, str | None]:
     """Material and panel of the side below the belt line."""
     if t < 0.035 and low >= shell.lamps[0] and high <= shell.lamps[1]:
@@ -279,7 +279,7 @@ def _flank(
         return TRIM, None
     if shell.clad and high <= S2 and low >= B3:
         return TRIM, None
-    return beside
+    return door
 
 
 def _end(shell: Shell, size: Point, half: F64, kept_rows: Sequence[int], *, front: bool) -> Mesh:

@@ -38,24 +38,24 @@ class Labels:
         box: x0, y0, x1, y1 of the visible pixels, at pixel edges [N, 4].
         pixels: Number of visible pixels [N].
         share: Visible pixels as a share of those that it would cover without occlusion, 0 to 1 [N].
-        inside: Share of its projection that lies in the image, 0 to 1 [N].
+        image_share: Share of its projection that lies in the image, 0 to 1 [N].
     """
 
     tag: I32
     box: F64
     pixels: I32
     share: F64
-    inside: F64
+    image_share: F64
 
     def __len__(self) -> int:
         return len(self.tag)
 
 
-def label_picture(stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2) -> Labels:
+def label_image(scene: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2) -> Labels:
     """Labels of a picture. Things with tags below 1 get none; things that share a tag count as one.
 
     Args:
-        stage: The scene.
+        scene: The scene.
         view: The view that was rendered.
         rendering: The rendered pictures.
         index: Which of them.
@@ -65,27 +65,27 @@ def label_picture(stage: RenderScene, view: View, rendering: Rendering, index: i
         ConfigError: The picture shows another view.
     """
     tags, boxes, pixels = extents(_tags(view, rendering, index))
-    unoccluded, inside = _amodal(stage, view, tags, scale=scale)
+    unoccluded, image_shares = _unoccluded_areas(scene, view, tags, scale=scale)
     shares = np.clip(pixels / np.maximum(unoccluded, 1e-9), 0.0, 1.0)
-    return Labels(tags, boxes, pixels, shares, inside)
+    return Labels(tags, boxes, pixels, shares, image_shares)
 
 
 def visible_share(
-    stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2
+    scene: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2
 ) -> dict[int, float]:
     """Visible share (0 to 1) of each thing of a view, by its tag (1 and above); 0 for what is not seen.
 
     Args:
-        stage: See `label_picture`.
-        view: See `label_picture`.
-        rendering: See `label_picture`.
-        index: See `label_picture`.
-        scale: See `label_picture`.
+        scene: See `label_image`.
+        view: See `label_image`.
+        rendering: See `label_image`.
+        index: See `label_image`.
+        scale: See `label_image`.
 
     Raises:
         ConfigError: The picture shows another view.
     """
-    labels = label_picture(stage, view, rendering, index, scale=scale)
+    labels = label_image(scene, view, rendering, index, scale=scale)
     shares = dict.fromkeys(sorted({entry.tag for entry in view.objects if entry.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))
 
@@ -125,19 +125,19 @@ def _tags(view: View, rendering: Rendering, index: int) -> I32:
     return np.asarray(rendering.tag[index], np.int32)
 
 
-def bounds(stage: RenderScene, mesh: int) -> tuple[F64, F64]:
+def bounds(scene: RenderScene, mesh: int) -> tuple[F64, F64]:
     """Return the smallest and largest corner of a mesh of a scene in its own frame, [3] each, m."""
-    cached_bounds = _bounds.setdefault(stage, {})
+    cached_bounds = _bounds.setdefault(scene, {})
     if mesh not in cached_bounds:
-        face_indices = stage.listed.numpy()[stage.first[mesh] : stage.first[mesh] + stage.count[mesh]]
-        corners = stage.vertices.numpy()[np.unique(stage.faces.numpy()[face_indices])].astype(np.float64)
+        face_indices = scene.listed.numpy()[scene.first[mesh] : scene.first[mesh] + scene.count[mesh]]
+        corners = scene.vertices.numpy()[np.unique(scene.faces.numpy()[face_indices])].astype(np.float64)
         cached_bounds[mesh] = (corners.min(0), corners.max(0)) if len(corners) else (np.zeros(3), np.zeros(3))
     return cached_bounds[mesh]
 
 
-def _projected(stage: RenderScene, view: View, objects: Sequence[SceneObject], inverse: F64) -> F64:
+def _projected(scene: RenderScene, view: View, objects: Sequence[SceneObject], inverse: F64) -> F64:
     """x0, y0, x1, y1 at pixel edges [T, 4] of the boxes around things, cut at the near plane; NaN behind it."""
-    box_bounds = np.array([bounds(stage, entry.mesh) for entry in objects])
+    box_bounds = np.array([bounds(scene, entry.mesh) for entry in objects])
     corner_bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     points = np.where(corner_bits[None] == 1, box_bounds[:, 1, None], box_bounds[:, 0, None])
     to_camera = inverse @ np.array([entry.pose for entry in objects])
@@ -156,7 +156,7 @@ def _projected(stage: RenderScene, view: View, objects: Sequence[SceneObject], i
     return np.concatenate([lower, upper], 1)
 
 
-def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
+def _unoccluded_areas(scene: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
     """Return the unoccluded pixels of each tag in the image [N], and the share of its area inside the image [N]."""
     if not len(tags):
         return np.zeros(0), np.zeros(0)
@@ -168,7 +168,7 @@ def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F
         raise ConfigError(f"label_picture: the picture shows tag {missing}, which its view lacks; give its own view")
     width, height = float(view.camera.width), float(view.camera.height)
     inverse = np.asarray(np.linalg.inv(view.pose), np.float64)
-    object_boxes = _projected(stage, view, objects, inverse)
+    object_boxes = _projected(scene, view, objects, inverse)
     tag_boxes = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (len(tags), 1))
     np.minimum.at(tag_boxes[:, :2], owners, object_boxes[:, :2])
     np.maximum.at(tag_boxes[:, 2:], owners, object_boxes[:, 2:])
@@ -187,7 +187,7 @@ def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F
         batch = slice(batch_start, batch_start + BATCH)
         batch_objects = [objects_of_tag[tag_index] for tag_index in crop_tags[batch]]
         crop_pixels[batch], crop_areas[batch] = _standalone_pixels(
-            stage, view, (objects, batch_objects), crops[batch], scale=scale
+            scene, view, (objects, batch_objects), crops[batch], scale=scale
         )
     inside = np.ones(len(tags))
     inside[truncated] = crop_areas[truncated] / np.maximum(
@@ -197,7 +197,7 @@ def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F
 
 
 def _standalone_pixels(
-    stage: RenderScene, view: View, group: tuple[Sequence[SceneObject], Sequence[I32]], crops: F64, *, scale: int
+    scene: RenderScene, view: View, group: tuple[Sequence[SceneObject], Sequence[I32]], crops: F64, *, scale: int
 ) -> tuple[F64, F64]:
     """Return the pixels that objects cover alone in crops [M, 4], by the image's rule and by area [M each]."""
     objects, members = group
@@ -210,19 +210,19 @@ def _standalone_pixels(
     ) / pixel_scale - 0.5  # as `kernel_lens` has it
     lens = np.concatenate([focal, centre], 1).astype(np.float32)
     object_order = np.concatenate(list(members))
-    firsts = np.array([stage.first[objects[object_index].mesh] for object_index in object_order], np.int32)
-    counts = np.array([stage.count[objects[object_index].mesh] for object_index in object_order], np.int32)
+    firsts = np.array([scene.first[objects[object_index].mesh] for object_index in object_order], np.int32)
+    counts = np.array([scene.count[objects[object_index].mesh] for object_index in object_order], np.int32)
     matrices = np.linalg.inv(view.pose) @ np.array([objects[object_index].pose for object_index in object_order])
-    device, face_count = stage.device, int(counts.sum())
+    device, face_count = scene.device, int(counts.sum())
     views = np.repeat(np.arange(len(crops)), [len(group_members) for group_members in members]).astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     crop_samples = CROP * scale
     samples = wp.zeros((len(crops), crop_samples, crop_samples), dtype=wp.uint64, device=device)
     lanes = FACE_LANES if device != "cpu" else 1
     inputs = [
-        stage.vertices,
-        stage.faces,
-        stage.listed,
+        scene.vertices,
+        scene.faces,
+        scene.listed,
         wp.array(starts, dtype=int, device=device),
         wp.array(firsts, dtype=int, device=device),
         wp.array(views, dtype=int, device=device),

@@ -120,7 +120,7 @@ def nearby_lights(
         ),
     }
     for name, (kernel_struct, (rows, circles)) in tables.items():
-        starts, indices = _grid(circles, len(views))
+        starts, indices = _circles_by_cell(circles, len(views))
         table = rows if len(rows) else np.zeros(1, rows.dtype)
         setattr(light_tables, f"{name}s", wp.array(table, dtype=kernel_struct, device=scene.device))
         setattr(light_tables, f"{name}_start", wp.array(starts, dtype=int, device=scene.device))
@@ -157,7 +157,7 @@ def _lamps(scene: RenderScene, views: Sequence[View], bodies: ObjectTable) -> Ro
     eye_positions = np.array([view_index.pose[:2, 3] for view_index in views])
     dark_views = np.flatnonzero(strength > 0.0)
     if len(dark_views):
-        street_rows, circles = scene.cached("street lamps", lambda: _fixed_lamps(_street_lamps(scene)))
+        street_rows, circles = scene.compute_once("street lamps", lambda: _fixed_lamps(_street_lamps(scene)))
         offsets = circles[None, :, :2] - eye_positions[dark_views, None]
         dark_index, lamp_index = np.nonzero(np.hypot(*np.moveaxis(offsets, -1, 0)) < LIT_UP_TO)
         rows = street_rows[lamp_index]
@@ -202,7 +202,7 @@ def _rows_of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows],
 
 def _cached_beams(scene: RenderScene, mesh: int) -> Rows:
     """Return the lamps of a body in its own frame, with their circles; cached."""
-    return scene.cached(("lamps", mesh), lambda: _fixed_lamps(_beams(scene, mesh)))  # type: ignore[no-any-return]
+    return scene.compute_once(("lamps", mesh), lambda: _fixed_lamps(_beams(scene, mesh)))  # type: ignore[no-any-return]
 
 
 def _fixed_lamps(lamps: Sequence[SceneLamp]) -> Rows:
@@ -244,7 +244,7 @@ def _occluders(scene: RenderScene, views: Sequence[View], bodies: ObjectTable) -
     mesh_indices, mesh_of_body = np.unique(bodies.mesh[is_near], return_inverse=True)
     if not len(mesh_indices):
         return rows, places
-    ground_covers = zip(*(scene.standing(int(mesh)) for mesh in mesh_indices), strict=True)
+    ground_covers = zip(*(scene.ground_cover(int(mesh)) for mesh in mesh_indices), strict=True)
     centres, half_sizes, underside_heights, heights = (np.array(values)[mesh_of_body] for values in ground_covers)
     is_high = heights > FLAT
     centres, half_sizes, underside_heights, heights = (
@@ -265,7 +265,7 @@ def struct_array(row_type: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
     return np.array(rows, dtype) if rows else np.zeros(1, dtype)
 
 
-def _grid(places: F64, views: int) -> tuple[I32, I32]:
+def _circles_by_cell(places: F64, views: int) -> tuple[I32, I32]:
     """List the circles (view, x, y, radius; m from the eye) that touch each cell of the grid of each view.
 
     Returns:

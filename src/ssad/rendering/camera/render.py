@@ -32,7 +32,7 @@ from ssad.rendering.camera.scene import (
     SceneObject,
     TextureDecal,
     TextureLayer,
-    collect,
+    collect_objects,
 )
 from ssad.rendering.camera.sensor import (
     BRIGHTEST,
@@ -242,7 +242,7 @@ class _VisibilityPass:
 
     def __init__(
         self,
-        stage: RenderScene,
+        scene: RenderScene,
         draws: DrawCalls,
         lens: F32,
         *,
@@ -251,9 +251,9 @@ class _VisibilityPass:
         scale: int,
         near: float = NEAR,
     ) -> None:
-        device = stage.device
+        device = scene.device
         face_count = int(draws.counts.sum())
-        draw_table = shade.Drawn()
+        draw_table = shade.DrawRanges()
         starts = wp.array(np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device)
         firsts = wp.array(draws.firsts, dtype=int, device=device)
         draw_table.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
@@ -264,7 +264,7 @@ class _VisibilityPass:
         views = wp.array(draws.views, dtype=int, device=device)
         height, width = size[0] * scale, size[1] * scale
         self.samples = draw_table.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
-        self.drawn = draw_table
+        self.draw_ranges = draw_table
         draw_table.owners = wp.empty(max(face_count, 1), dtype=wp.vec2i, device=device)
         if not face_count:
             return
@@ -276,9 +276,9 @@ class _VisibilityPass:
         large_count = wp.zeros(1, dtype=int, device=device)
         lanes = FACE_LANES if on_gpu else 1
         inputs = [
-            stage.vertices,
-            stage.faces,
-            stage.listed,
+            scene.vertices,
+            scene.faces,
+            scene.listed,
             starts,
             firsts,
             views,
@@ -300,7 +300,7 @@ class _VisibilityPass:
 
 
 def render(
-    stage: RenderScene,
+    scene: RenderScene,
     views: Sequence[View],
     *,
     scale: int = 2,
@@ -312,7 +312,7 @@ def render(
     """Render views of one size.
 
     Args:
-        stage: The scene.
+        scene: The scene.
         views: The views.
         scale: Samples along each side of a pixel.
         quality: Which effects of light are rendered.
@@ -343,10 +343,10 @@ def render(
         lights.append(view_light)
         exposures.append(exposure)
     poses = np.array([entry.pose for entry in views], np.float64)
-    bodies = collect([entry.objects for entry in views])
+    bodies = collect_objects([entry.objects for entry in views])
     # Beyond six extinction lengths fog hides everything.
     far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
-    draws = stage.gather(
+    draws = scene.gather_draw_calls(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies,
         eyes=poses[:, :3, 3],
@@ -354,11 +354,11 @@ def render(
         reach=(70.0, 180.0),
         far=far_limits,
     )
-    visible = _VisibilityPass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
-    shadows = _sun_shadows(stage, views, bodies, [view_light[0] for view_light in lights], quality)
-    nearby_light = _near(stage, views, bodies, quality)
-    device, shape = stage.device, (len(views), *size)
-    layer_tables = _layers(draws, views, stage.device)
+    visible = _VisibilityPass(scene, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
+    shadows = _sun_shadows(scene, views, bodies, [view_light[0] for view_light in lights], quality)
+    nearby_light = _near(scene, views, bodies, quality)
+    device, shape = scene.device, (len(views), *size)
+    layer_tables = _layers(draws, views, scene.device)
     projecting = any(lamp.texture >= 0 for entry in views for lamp in entry.lamps)
     output = shade.Output()
     output.radiance = wp.empty(shape, dtype=wp.vec3, device=device)
@@ -374,8 +374,8 @@ def render(
     # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
     inputs = [
-        stage.geometry,
-        visible.drawn,
+        scene.geometry,
+        visible.draw_ranges,
         layer_tables,
         visible.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
@@ -429,7 +429,7 @@ def _surface(out: Any, lens: F64, poses: F64) -> SurfaceMap:
 
 
 def _sun_shadows(
-    stage: RenderScene,
+    scene: RenderScene,
     views: Sequence[View],
     bodies: ObjectTable,
     suns: Sequence[tuple[float, ...]],
@@ -447,16 +447,16 @@ def _sun_shadows(
     is_up = any(sun[2] > 0.02 for sun in suns)
     shadows = shade.SunShadows()
     shadows.wide, shadows.to_wide, shadows.wide_texel = _sun_map(
-        stage, bodies, suns, wide_middles, SHADOW_REACH, SHADOW_SIZE if quality.shadows and is_up else 0
+        scene, bodies, suns, wide_middles, SHADOW_REACH, SHADOW_SIZE if quality.shadows and is_up else 0
     )
     shadows.fine, shadows.to_fine, shadows.fine_texel = _sun_map(
-        stage, bodies, suns, fine_middles, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and is_up else 0
+        scene, bodies, suns, fine_middles, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and is_up else 0
     )
     return shadows
 
 
 def _sun_map(  # noqa: PLR0917
-    stage: RenderScene, bodies: ObjectTable, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
+    scene: RenderScene, bodies: ObjectTable, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
 ) -> tuple[Any, Any, float]:
     """Render a shadow map [B, size, size] around each middle.
 
@@ -468,14 +468,14 @@ def _sun_map(  # noqa: PLR0917
     to_light = _light_cameras(np.array(suns), middles)
     to_texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
     to_texels[:2, 3] = size / 2
-    matrices = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=stage.device)
+    matrices = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=scene.device)
     if not size:
-        return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=stage.device), matrices, texel
+        return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=scene.device), matrices, texel
     image_centre = size / 2 - 0.5
     intrinsics = np.tile(np.array([1 / texel, 1 / texel, image_centre, image_centre], np.float32), (len(middles), 1))
     # Far enough for everything that can cast a shadow into the map; small street objects only near its middle.
     far_limit = 1.4 * reach + 11.0
-    draws = stage.gather(
+    draws = scene.gather_draw_calls(
         to_light,
         bodies,
         eyes=middles,
@@ -485,7 +485,7 @@ def _sun_map(  # noqa: PLR0917
         horizon=False,
         casts_shadows=True,
     )
-    return _VisibilityPass(stage, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+    return _VisibilityPass(scene, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
 
 def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
@@ -536,16 +536,16 @@ def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
     return table
 
 
-def _near(stage: RenderScene, views: Sequence[View], bodies: ObjectTable, quality: RenderQuality) -> Any:
+def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, quality: RenderQuality) -> Any:
     """Build lamps with their shadow maps, and the bodies that occlude the sky from the ground."""
-    near_light = nearby_lights(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
+    near_light = nearby_lights(scene, views, bodies, lamps=quality.lamps, contact=quality.contact)
     shadow_lamps = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not shadow_lamps:
-        near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
+        near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=scene.device)
         return near_light
     poses = np.array([lamp.pose for _, lamp in shadow_lamps], np.float64)
-    bodies_of_lamps = collect([view.objects for view, _ in shadow_lamps])
-    draws = stage.gather(
+    bodies_of_lamps = collect_objects([view.objects for view, _ in shadow_lamps])
+    draws = scene.gather_draw_calls(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies_of_lamps,
         eyes=poses[:, :3, 3],
@@ -557,7 +557,7 @@ def _near(stage: RenderScene, views: Sequence[View], bodies: ObjectTable, qualit
     )
     lens = np.array([lamp_lens(lamp) for _, lamp in shadow_lamps], np.float32)
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
-    near_light.shadows = _VisibilityPass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
+    near_light.shadows = _VisibilityPass(scene, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
     return near_light
 
 

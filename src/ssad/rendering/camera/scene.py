@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.errors import ConfigError
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, F64, I32, Bool
 from ssad.rendering.camera.kernels import matter
 from ssad.rendering.camera.kernels import shade as kernels
@@ -125,8 +125,8 @@ class SceneObject:
         tag: Number that identifies it in masks and boxes.
         layers: Textures that it wears, the lowest first; faces outside all panels (windows, lamps, tyres) never
             wear any.
-        lit: Whether its lamps are on; at night they light the scene.
-        hidden: Whether it is invisible; it still casts its shadow.
+        is_lit: Whether its lamps are on; at night they light the scene.
+        is_hidden: Whether it is invisible; it still casts its shadow.
     """
 
     mesh: int
@@ -134,8 +134,8 @@ class SceneObject:
     paint: tuple[float, float, float] = (0.5, 0.5, 0.5)
     tag: int = 0
     layers: tuple[TextureLayer, ...] = ()
-    lit: bool = True
-    hidden: bool = False
+    is_lit: bool = True
+    is_hidden: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class ObjectTable:
     hidden: Bool
 
 
-def collect(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
+def collect_objects(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
     """The things of B views in arrays.
 
     Args:
@@ -193,8 +193,8 @@ def collect(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
         np.array([entry.pose for entry in flat_objects], np.float64).reshape(-1, 4, 4),
         np.array([entry.paint for entry in flat_objects], np.float32).reshape(-1, 3),
         np.array([entry.tag for entry in flat_objects], np.int32),
-        np.array([entry.lit for entry in flat_objects], bool),
-        np.array([entry.hidden for entry in flat_objects], bool),
+        np.array([entry.is_lit for entry in flat_objects], bool),
+        np.array([entry.is_hidden for entry in flat_objects], bool),
     )
 
 
@@ -213,7 +213,7 @@ class RenderScene:
     """Triangles of a street (or none) and of meshes, on a device."""
 
     def __init__(self, street: Street | None, meshes: Sequence[Mesh], *, device: str = "cpu") -> None:
-        quiet_warp()
+        start_warp_quietly()
         self.street, self.device = street, device
         if street is not None:
             x, y = np.meshgrid(np.arange(street.nx), np.arange(street.ny))
@@ -225,10 +225,10 @@ class RenderScene:
         if not parts:
             raise ConfigError("a stage needs a street or a mesh")
         vertices, faces, normals, uvs, material, surfaces = [], [], [], [], [], []
-        listed = [street.order.astype(np.int32)] if street is not None else []
+        listed_faces = [street.order.astype(np.int32)] if street is not None else []
         firsts, counts, centres, radii = [], [], [], []
         vertex_base = face_base = material_base = 0
-        list_position = len(listed[0]) if listed else 0
+        list_position = len(listed_faces[0]) if listed_faces else 0
         for part_index, part in enumerate(parts):
             # Parts share one buffer: indices are shifted by the entries before them.
             vertices.append(part.vertices)
@@ -238,7 +238,7 @@ class RenderScene:
             material.append(part.material + material_base)
             surfaces += [surface(entry) for entry in part.materials]
             if street is None or part_index > 0:
-                listed.append(np.arange(face_base, face_base + len(part.faces), dtype=np.int32))
+                listed_faces.append(np.arange(face_base, face_base + len(part.faces), dtype=np.int32))
                 firsts.append(list_position)
                 counts.append(len(part.faces))
                 lower, upper = part.bounds()
@@ -272,12 +272,12 @@ class RenderScene:
         self._cache: dict[Any, Any] = {}
         surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = to_device(surface_rows, matter.Surface)
-        self.listed = to_device(np.concatenate(listed), wp.int32)
+        self.listed = to_device(np.concatenate(listed_faces), wp.int32)
         self.geometry = kernels.Geometry()
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
 
-    def cached(self, key: Any, make: Callable[[], Any]) -> Any:
+    def compute_once(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return a value that is computed once for this scene, under a key."""
         if key not in self._cache:
             self._cache[key] = make()
@@ -291,17 +291,17 @@ class RenderScene:
             body.areas(),
             body.corners().mean(1),
         )
-        found = {}
+        lights_by_kind = {}
         for name in LAMPS:
             weight = areas * np.isin(
                 body.material,
                 [material_index for material_index, material_name in enumerate(names) if material_name == name],
             )
             total = float(weight.sum())
-            found[name] = (weight @ middles / max(total, 1e-12), total)
-        return found
+            lights_by_kind[name] = (weight @ middles / max(total, 1e-12), total)
+        return lights_by_kind
 
-    def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
+    def ground_cover(self, mesh: int) -> tuple[F64, F64, float, float]:
         """Return the ground that a mesh covers.
 
         The faces that look down from at most half its height determine the covered share of the bounding rectangle,
@@ -314,7 +314,7 @@ class RenderScene:
             Middle [2]; half length and half width of the covered area [2]; height of its underside; and height of
             its top, all in the object frame, m.
         """
-        return self.cached(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
+        return self.compute_once(("standing", mesh), lambda: _ground_cover(self.meshes[mesh]))  # type: ignore[no-any-return]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
@@ -360,7 +360,7 @@ class RenderScene:
             view_index[has_faces].astype(np.int32),
         )
 
-    def gather(
+    def gather_draw_calls(
         self,
         inverses: F64,
         bodies: ObjectTable,
@@ -437,8 +437,8 @@ def surface(material: Material) -> tuple[Any, ...]:
     )
 
 
-def _standing(body: Mesh) -> tuple[F64, F64, float, float]:
-    """See `RenderScene.standing`."""
+def _ground_cover(body: Mesh) -> tuple[F64, F64, float, float]:
+    """See `RenderScene.ground_cover`."""
     lower, upper = body.bounds()
     corners = body.corners()
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -105,7 +105,7 @@ class SceneEdit:
         for card, mesh in zip(self.cards, cards, strict=True) if sun[2] > 0.0 else ():
             pose = target.pose.copy()
             pose[:3, 3] += card.away * sun - LIFT * target.pose[:3, 2]
-            hung_cards.append(SceneObject(mesh, pose, tag=0, hidden=True))
+            hung_cards.append(SceneObject(mesh, pose, tag=0, is_hidden=True))
         scale = per_lux(view.weather)
         lamps = (replace(entry, pose=target.pose @ entry.pose, power=entry.power * scale) for entry in self.lamps)
         decals = (

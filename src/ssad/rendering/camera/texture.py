@@ -235,7 +235,7 @@ def retexture(lookups: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
 
     Args:
         lookups: What pixels see of it.
-        texture: Linear albedo [3, H, W], 0 to 1 (see `printable`); of each of several pictures (see `combine_taps`)
+        texture: Linear albedo [3, H, W], 0 to 1 (see `to_printable`); of each of several pictures (see `combine_taps`)
             [B, 3, H, W].
         radiance: Of the picture whose taps these are [B, H, W, 3], without the texture.
 
@@ -255,7 +255,7 @@ def retexture(lookups: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
     return base_pixels.index_add(0, lookups.pixel, colour.to(base_pixels.dtype)).reshape(radiance.shape)
 
 
-def printable(colour: Tensor) -> Tensor:
+def to_printable(colour: Tensor) -> Tensor:
     """Map a colour in 0..1 to the albedo that ink and paper can have, `PRINTABLE`."""
     darkest, brightest = PRINTABLE
     return darkest + (brightest - darkest) * colour.clamp(0.0, 1.0)

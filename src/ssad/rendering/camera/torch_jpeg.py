@@ -44,14 +44,14 @@ ACCURATE = 96  # quality from which libjpeg-turbo uses the accurate DCT by defau
 TIE = 2.0**-12  # makes halves round up whatever the order of the sums
 
 
-def _straight(value: Tensor, rounded: Tensor) -> Tensor:
+def _straight_through(value: Tensor, rounded: Tensor) -> Tensor:
     """Return the rounded value with the slope of the value (straight-through)."""
     return rounded.detach() + (value - value.detach())
 
 
 def _nearest(value: Tensor) -> Tensor:
     """Round to the nearest whole number, halves up, with slope one."""
-    return _straight(value, torch.floor(value + (0.5 + TIE)))
+    return _straight_through(value, torch.floor(value + (0.5 + TIE)))
 
 
 def to_8_bits(image: Tensor) -> Tensor:
@@ -316,7 +316,7 @@ def block_of(subsampling: str) -> int:
     return 16 if subsampling == "420" else 8
 
 
-def extend(image: Tensor, height: int, width: int) -> Tensor:
+def extend_border(image: Tensor, height: int, width: int) -> Tensor:
     """A picture with its last row and column repeated up to a size.
 
     Args:
@@ -337,7 +337,10 @@ def _repeat_border(planes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
     if all(size == full_size for size in sizes):
         return planes
     return torch.stack(
-        [extend(plane[:, :height, :width], *full_size) for plane, (height, width) in zip(planes, sizes, strict=True)]
+        [
+            extend_border(plane[:, :height, :width], *full_size)
+            for plane, (height, width) in zip(planes, sizes, strict=True)
+        ]
     )
 
 
@@ -391,7 +394,7 @@ def compress(image: Tensor, sizes: Sequence[tuple[int, int]], quality: int, subs
         if is_subsampled
         else chrominance * unclipped[1]
     )
-    return _straight(_mix_planes(from_ycbcr, torch.cat([luminance, chrominance], 1)) * is_unclipped, codes)
+    return _straight_through(_mix_planes(from_ycbcr, torch.cat([luminance, chrominance], 1)) * is_unclipped, codes)
 
 
 def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bool | None = None) -> Tensor:
@@ -417,6 +420,6 @@ def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bo
     """
     block_pixels, (height, width) = block_of(subsampling), image.shape[2:]
     padded_size = (-(-height // block_pixels) * block_pixels, -(-width // block_pixels) * block_pixels)
-    padded = torch.stack([extend(entry, *padded_size) for entry in image])
+    padded = torch.stack([extend_border(entry, *padded_size) for entry in image])
     fast = quality < ACCURATE if fast is None else fast
     return compress(padded, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]

@@ -34,7 +34,7 @@ from ssad.rendering.camera.sensor import (
     point_spread,
 )
 from ssad.rendering.camera.texture import Taps
-from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compress, extend, quantisation
+from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compress, extend_border, quantisation
 
 TOP = 0.99975 * BRIGHTEST  # light at which the curve is cut off
 TOE = 0.0031308  # light below which sRGB is linear
@@ -56,10 +56,10 @@ def _lens_weights(blur: float, device: torch.device, dtype: torch.dtype) -> tupl
     for site, colour in enumerate((0, 1, 1, 2)):
         y, x = divmod(site, 2)
         square_weights[site, colour, y : y + 3, x : x + 3] = spread
-    return _constant(spread, device, dtype), _constant(square_weights, device, dtype)
+    return _constant_tensor(spread, device, dtype), _constant_tensor(square_weights, device, dtype)
 
 
-def _constant(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
+def _constant_tensor(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return a constant tensor that is valid in later calls, whatever the mode of this one."""
     # A tensor made in inference mode could not take part in autograd later.
     with torch.inference_mode(mode=False):
@@ -84,10 +84,10 @@ def _demosaic_weights(device: torch.device, dtype: torch.dtype) -> Tensor:
         for site, weights in enumerate(sites):
             y, x = divmod(site, 2)
             square[4 * colour + site, 0, y : y + 5, x : x + 5] = np.array(weights) / 8
-    return _constant(square, device, dtype)
+    return _constant_tensor(square, device, dtype)
 
 
-def _squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
+def _to_squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
     """A picture [B, C, H, W], mirrored at its borders, in squares of four: [B, C', H, W]."""
     height, width = image.shape[2:]
     padded = pad(image, (border, border + width % 2, border, border + height % 2), mode="reflect")
@@ -111,7 +111,7 @@ def photosites(light: Tensor, sensor: SensorModel) -> Tensor:
     colours = light.permute(0, 3, 1, 2)
     spread, square = _lens_weights(sensor.blur, light.device, light.dtype)
     if sensor.mosaic:
-        return _squares(colours, square, 1)[:, 0]
+        return _to_squares(colours, square, 1)[:, 0]
     if sensor.blur == 0:
         return light
     kernel = spread.expand(3, 1, 3, 3)
@@ -153,7 +153,7 @@ def demosaic(raw: Tensor) -> Tensor:
     Returns:
         Linear colours, [B, H, W, 3]; noise and edges can make them slightly negative.
     """
-    return _squares(raw[:, None], _demosaic_weights(raw.device, raw.dtype), 2).permute(0, 2, 3, 1)
+    return _to_squares(raw[:, None], _demosaic_weights(raw.device, raw.dtype), 2).permute(0, 2, 3, 1)
 
 
 def curve(light: Tensor) -> Tensor:
@@ -213,7 +213,7 @@ def draw_noise(shape: Sequence[int], sensor: SensorModel, generator: torch.Gener
     return torch.randn(size, generator=generator, device=generator.device)
 
 
-def large_draws(generators: Sequence[torch.Generator], device: torch.device) -> list[torch.Generator]:
+def generators_on_device(generators: Sequence[torch.Generator], device: torch.device) -> list[torch.Generator]:
     """Return generators for one draw per pixel or texel on a device.
 
     On the CPU they are the given generators, on a GPU new ones seeded by them. A GPU draws other numbers than
@@ -479,7 +479,9 @@ class ChangedWindow:
             image = developed[:, :, top : top + part_height, left : left + part_width]
         else:
             for single, (top, left), (part_height, part_width) in zip(developed, corners, sizes, strict=True):
-                extended_parts.append(extend(single[:, top : top + part_height, left : left + part_width], *coded_size))
+                extended_parts.append(
+                    extend_border(single[:, top : top + part_height, left : left + part_width], *coded_size)
+                )
             image = torch.stack(extended_parts)
         if self.quality is None:
             return image
@@ -563,7 +565,7 @@ def develop_at(
     count, height, width = radiance.shape[:3]
     rectangles = _rectangles(pixels, (count, height, width))
     window = ChangedWindow.of(rectangles, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
-    developed = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
+    developed_parts = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
     image_index = pixels // (height * width)
     corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[image_index]
-    return developed[image_index, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]
+    return developed_parts[image_index, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]

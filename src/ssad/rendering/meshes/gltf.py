@@ -79,26 +79,26 @@ class _Reader:
         self.triangles = FaceList()
         self.faces = self.visited = 0
 
-    def fail(self, message: str) -> FormatError:
+    def error(self, message: str) -> FormatError:
         return FormatError(f"{self.file}: {message}")
 
     def item(self, kind: str, index: Any) -> Any:
         table = self.tree.get(kind, [])
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(table):
-            raise self.fail(f"{kind}[{index}] does not exist (there are {len(table)})")
+            raise self.error(f"{kind}[{index}] does not exist (there are {len(table)})")
         return table[index]
 
     def read(self) -> FaceList:
         version = str(self.tree.get("asset", {}).get("version", ""))
         if not version.startswith("2"):
-            raise self.fail(f"glTF version '{version[:20]}'; only version 2 is read")
+            raise self.error(f"glTF version '{version[:20]}'; only version 2 is read")
         unsupported = [
             extension
             for extension in self.tree.get("extensionsRequired", [])
             if not str(extension).startswith(_HARMLESS)
         ]
         if unsupported:
-            raise self.fail(f"requires the extension {str(unsupported[0])[:60]}; export without it")
+            raise self.error(f"requires the extension {str(unsupported[0])[:60]}; export without it")
         self.triangles.materials = [
             self.material(material, index) for index, material in enumerate(self.tree.get("materials", []))
         ] + [DEFAULT]
@@ -117,11 +117,11 @@ class _Reader:
         self.visited += 1
         # The graph comes from an untrusted file and may contain cycles.
         if index in above or len(above) > safeio.MAX_DEPTH or self.visited > MAX_NODES:
-            raise self.fail(f"nodes[{index}]: the tree of nodes is a loop or too large")
+            raise self.error(f"nodes[{index}]: the tree of nodes is a loop or too large")
         node = self.item("nodes", index)
         matrix = parent @ _local(node)
         if not np.isfinite(matrix).all():
-            raise self.fail(f"nodes[{index}]: the matrix holds NaN or infinity")
+            raise self.error(f"nodes[{index}]: the matrix holds NaN or infinity")
         if "mesh" in node:
             mesh = self.item("meshes", node["mesh"])
             name = str(node.get("name") or mesh.get("name") or f"mesh {node['mesh']}")[:80]
@@ -137,29 +137,29 @@ class _Reader:
             return  # points and lines have no surface
         points = self.accessor(attributes["POSITION"], "VEC3", location)
         if "TEXCOORD_0" not in attributes:
-            raise self.fail(f"{location}: no texture coordinates (UVs); unwrap the mesh before the export")
+            raise self.error(f"{location}: no texture coordinates (UVs); unwrap the mesh before the export")
         uv = self.accessor(attributes["TEXCOORD_0"], "VEC2", location)
         normals = (
             self.accessor(attributes["NORMAL"], "VEC3", location) if "NORMAL" in attributes else np.zeros_like(points)
         )
         if not len(points) == len(uv) == len(normals):
-            raise self.fail(f"{location}: attributes have different lengths")
+            raise self.error(f"{location}: attributes have different lengths")
         if "indices" in data:
             indices = self.accessor(data["indices"], "SCALAR", location)[:, 0].astype(np.int64)
         else:
             indices = np.arange(len(points))
         if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
-            raise self.fail(
+            raise self.error(
                 f"{location}: index {int(indices.max())} is out of range (there are {len(points)} vertices)"
             )
         faces = _triangles(indices, mode)
         self.faces += len(faces)
         if self.faces > MAX_FACES:
-            raise self.fail(f"more than {MAX_FACES} triangles; simplify the mesh")
+            raise self.error(f"more than {MAX_FACES} triangles; simplify the mesh")
         linear = matrix[:3, :3]
         determinant = float(np.linalg.det(linear))
         if abs(determinant) < 1e-18:
-            raise self.fail(f"{location}: its node has a singular matrix")
+            raise self.error(f"{location}: its node has a singular matrix")
         # A mirroring node turns its faces inside out.
         if determinant < 0.0:
             faces = faces[:, ::-1]
@@ -180,15 +180,15 @@ class _Reader:
         description = self.item("accessors", index)
         label = f"accessors[{index}]"
         if "sparse" in description or "bufferView" not in description:
-            raise self.fail(f"{label}: sparse accessors are not read; export without them")
+            raise self.error(f"{label}: sparse accessors are not read; export without them")
         if description.get("type") != kind or description.get("componentType") not in _TYPES:
-            raise self.fail(
+            raise self.error(
                 f"{label}: type {description.get('type')} of {description.get('componentType')} "
                 f"where {kind} is needed ({location})"
             )
         count, width = int(description["count"]), _WIDTHS[kind]
         if not 0 <= count <= 3 * MAX_VERTICES:
-            raise self.fail(f"{label}: {count} entries; simplify the mesh")
+            raise self.error(f"{label}: {count} entries; simplify the mesh")
         dtype = np.dtype(_TYPES[description["componentType"]])
         buffer_view = self.item("bufferViews", description["bufferView"])
         buffer = self.buffer(buffer_view["buffer"])
@@ -198,7 +198,9 @@ class _Reader:
         # Offsets and counts come from the file: check them before any view into the buffer is made.
         end = offset + (count - 1) * stride + dtype.itemsize * width if count else 0
         if min(start, size, offset) < 0 or stride < dtype.itemsize * width or start + size > len(buffer) or end > size:
-            raise self.fail(f"{label}: reaches past the end of its buffer ({len(buffer)} bytes): the file is cut short")
+            raise self.error(
+                f"{label}: reaches past the end of its buffer ({len(buffer)} bytes): the file is cut short"
+            )
         if not count:
             return np.zeros((0, width))
         raw_bytes = np.frombuffer(buffer, np.uint8, count=end, offset=start)[offset:]
@@ -215,17 +217,17 @@ class _Reader:
         uri = description.get("uri")
         if uri is None:
             if self.chunk is None or index != 0:
-                raise self.fail(f"buffers[{index}] has no data")
+                raise self.error(f"buffers[{index}] has no data")
             content = self.chunk
         elif uri.startswith("data:"):
             try:
                 content = base64.b64decode(uri.split(",", 1)[1], validate=True)
             except (IndexError, binascii.Error):
-                raise self.fail(f"buffers[{index}]: the data URI is not base64") from None
+                raise self.error(f"buffers[{index}]: the data URI is not base64") from None
         else:
             content = safeio.read_bytes(beside(self.file, unquote(uri)), limit=MAX_BYTES)
         if len(content) < int(description["byteLength"]):
-            raise self.fail(f"buffers[{index}] is cut short: {len(content)} of {description['byteLength']} bytes")
+            raise self.error(f"buffers[{index}] is cut short: {len(content)} of {description['byteLength']} bytes")
         self.buffers[index] = content
         return content
 
@@ -240,7 +242,7 @@ class _Reader:
         )
         values = np.array([*colour, *emissive, metallic, roughness])
         if len(colour) != 3 or not np.isfinite(values).all():
-            raise self.fail(f"materials[{index}]: a colour is not three finite numbers")
+            raise self.error(f"materials[{index}]: a colour is not three finite numbers")
         red, green, blue = (float(np.clip(value, 0.0, 1.0)) for value in colour)
         specular = 0.04 + 0.46 * float(np.clip(metallic, 0.0, 1.0)) if "metallicFactor" in metallic_roughness else 0.04
         gloss = 1.0 - float(np.clip(roughness, 0.0, 1.0))

@@ -30,18 +30,18 @@ class _Obj:
         self.panel: list[int] = []
         self.material = self.group = "default"
 
-    def fail(self, message: str) -> FormatError:
+    def error(self, message: str) -> FormatError:
         return FormatError(f"{self.file}:{self.line}: {message}")
 
     def numbers(self, words: Sequence[str], count: int) -> tuple[float, ...]:
         try:
             values = tuple(float(word) for word in words[:count])
         except ValueError:
-            raise self.fail(f"'{' '.join(words)[:40]}' is not a list of numbers") from None
+            raise self.error(f"'{' '.join(words)[:40]}' is not a list of numbers") from None
         if len(values) < count:
-            raise self.fail(f"{len(values)} numbers where {count} are needed")
+            raise self.error(f"{len(values)} numbers where {count} are needed")
         if not np.isfinite(values).all():
-            raise self.fail("NaN or infinity is not a coordinate; mend the mesh")
+            raise self.error("NaN or infinity is not a coordinate; mend the mesh")
         return values
 
     def corner(self, word: str) -> tuple[int, int, int]:
@@ -54,23 +54,23 @@ class _Obj:
             try:
                 index = int(token)
             except ValueError:
-                raise self.fail(f"'{word[:40]}' is not a corner of a face") from None
+                raise self.error(f"'{word[:40]}' is not a corner of a face") from None
             # OBJ indices count from 1; negative ones count back from the latest entry.
             index = index - 1 if index > 0 else len(table) + index
             if index == -1 or not 0 <= index < len(table):
-                raise self.fail(f"{label} index {token} is out of range (there are {len(table)})")
+                raise self.error(f"{label} index {token} is out of range (there are {len(table)})")
             indices.append(index)
         if indices[0] < 0:
-            raise self.fail("a corner of a face names no vertex")
+            raise self.error("a corner of a face names no vertex")
         if indices[1] < 0:
-            raise self.fail("a face has no texture coordinates (UVs); unwrap the mesh before the export")
+            raise self.error("a face has no texture coordinates (UVs); unwrap the mesh before the export")
         return indices[0], indices[1], indices[2]
 
     def face(self, words: Sequence[str]) -> None:
         if len(words) < 3:
-            raise self.fail("a face needs three corners")
+            raise self.error("a face needs three corners")
         if len(words) > 1000:
-            raise self.fail(f"a face with {len(words)} corners; triangulate the mesh")
+            raise self.error(f"a face with {len(words)} corners; triangulate the mesh")
         corners = [self.corner(word) for word in words]
         triangles = (
             [(0, 1, 2)]
@@ -78,7 +78,7 @@ class _Obj:
             else self.split(np.array([self.v[corner_triple[0]] for corner_triple in corners]))
         )
         if len(self.look) + len(triangles) > MAX_FACES:
-            raise self.fail(f"more than {MAX_FACES} triangles; simplify the mesh")
+            raise self.error(f"more than {MAX_FACES} triangles; simplify the mesh")
         material_index = self.order.setdefault(self.material, len(self.order))
         group_index = self.groups.setdefault(self.group, len(self.groups))
         for triangle in triangles:
@@ -124,7 +124,7 @@ def read_obj(file: Path) -> FaceList:
         if key in tables:
             entries, count = tables[key]
             if len(entries) >= MAX_VERTICES:
-                raise state.fail(f"more than {MAX_VERTICES} entries '{key}'; simplify the mesh")
+                raise state.error(f"more than {MAX_VERTICES} entries '{key}'; simplify the mesh")
             entries.append(state.numbers(arguments, count))
         elif key == "f":
             state.face(arguments)

@@ -9,16 +9,16 @@ import numpy as np
 
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 from ssad.core.seeding import generator
 from ssad.rendering.meshes.mesh import F32
-from ssad.rendering.street.dressing import Masts, furnish, light_streets, plant, signals
+from ssad.rendering.street.dressing import Masts, place_furniture, place_signal_masts, place_street_lamps, plant_trees
 from ssad.rendering.street.free_ground import FreeGround, sides
-from ssad.rendering.street.markings import paint
+from ssad.rendering.street.markings import paint_markings
 from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
 from ssad.rendering.street.palette import STYLES, TownMaterials, style_of
-from ssad.rendering.street.paving import pave
-from ssad.rendering.street.plots import fill_blocks, line_streets
+from ssad.rendering.street.paving import pave_ground
+from ssad.rendering.street.plots import build_along_streets, fill_blocks
 from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
 from ssad.world.roads.library import load_town
@@ -44,14 +44,14 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     builder, ground = TriangleBuilder(), survey(graph)
     free_ground, masts, street_sides = FreeGround(graph, ground), Masts(), sides(graph)
     # The order matters: each step occupies free ground and draws from the same generator.
-    pave(builder, graph, ground, materials)
-    paint(builder, graph, materials)
-    signals(builder, graph, free_ground, materials, masts)
-    light_streets(builder, free_ground, materials, street_sides, masts)
-    plots = line_streets(builder, free_ground, materials, street_sides)
+    pave_ground(builder, graph, ground, materials)
+    paint_markings(builder, graph, materials)
+    place_signal_masts(builder, graph, free_ground, materials, masts)
+    place_street_lamps(builder, free_ground, materials, street_sides, masts)
+    plots = build_along_streets(builder, free_ground, materials, street_sides)
     fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
-    furnish(builder, free_ground, materials, street_sides)
-    plant(builder, free_ground, materials, plots.parks)
+    place_furniture(builder, free_ground, materials, street_sides)
+    plant_trees(builder, free_ground, materials, plots.parks)
     geometry = join(builder.pieces)
     origin, nx, ny, order, offset = tiles(np.concatenate(builder.owner), geometry.levels)
     return Street(
@@ -111,7 +111,7 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
         "rule_lane",
     ):
         digest.update(getattr(graph, key).tobytes())
-    path = home() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
+    path = home_folder() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
     if path.exists():
         with contextlib.suppress(FormatError):  # a broken file is built again below
             return load_street(path)

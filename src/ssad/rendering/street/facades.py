@@ -73,12 +73,12 @@ def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]
     )
 
 
-def panes(
+def windows(
     wall: Wall,
     x: F64,
     z: F64,
     size: tuple[float, float],
-    look: TownMaterials,
+    materials: TownMaterials,
     *,
     frame: int,
     sill: bool = True,
@@ -89,10 +89,10 @@ def panes(
     if not len(x):
         return []
     width, height = size
-    rng = look.generator
+    rng = materials.generator
     frame_width = 0.07
     glass_materials = np.where(
-        rng.random(len(x)) < blinds, rng.choice(look.blind, len(x)), rng.choice(look.glass, len(x))
+        rng.random(len(x)) < blinds, rng.choice(materials.blind, len(x)), rng.choice(materials.glass, len(x))
     )
     parts = [
         flat(
@@ -109,21 +109,21 @@ def panes(
         front = wall.quads(x - 0.12, z - 0.16, width + 0.24, 0.10, 0.14)
         back = wall.quads(x - 0.12, z - 0.06, width + 0.24, 0.0, 0.0)
         top = np.stack([front[:, 3], front[:, 2], back[:, 1], back[:, 0]], axis=1)
-        parts.append(flat(np.concatenate([front, top]), look.stone[0], levels=NEAR))
+        parts.append(flat(np.concatenate([front, top]), materials.stone[0], levels=NEAR))
     return parts
 
 
-def rows(length: float, count: int, width: float, *, margin: float = 0.0) -> F64:
+def evenly_spaced(length: float, count: int, width: float, *, margin: float = 0.0) -> F64:
     """Left edges of `count` things of one width spread evenly over a length."""
     bay_width = (length - 2 * margin) / max(count, 1)
     return np.asarray(margin + bay_width * (np.arange(count) + 0.5) - width / 2)
 
 
-def grid(
+def window_grid(
     wall: Wall,
     floors: int,
     storey: float,
-    look: TownMaterials,
+    materials: TownMaterials,
     *,
     size: tuple[float, float],
     bay: float,
@@ -137,23 +137,25 @@ def grid(
     count = int(wall.length // bay)
     if count < 1 or floors <= first:
         return []
-    left_edges = rows(wall.length, count, size[0])
+    left_edges = evenly_spaced(wall.length, count, size[0])
     sills = ground + np.arange(first, floors) * storey + 0.32 * storey
     xx, zz = (grid_values.reshape(-1) for grid_values in np.meshgrid(left_edges, sills))
     if skip is not None and first == 0:
         on_first_floor = zz < ground + storey
         is_clear = ~(on_first_floor & (np.abs(xx[:, None] + size[0] / 2 - skip[None]).min(axis=1) < 0.9 + size[0] / 2))
         xx, zz = xx[is_clear], zz[is_clear]
-    return panes(wall, xx, zz, size, look, frame=frame, sill=sill)
+    return windows(wall, xx, zz, size, materials, frame=frame, sill=sill)
 
 
-def door(wall: Wall, x: float, look: TownMaterials, *, size: tuple[float, float] = (1.0, 2.1)) -> list[TrianglePiece]:
+def door(
+    wall: Wall, x: float, materials: TownMaterials, *, size: tuple[float, float] = (1.0, 2.1)
+) -> list[TrianglePiece]:
     """A door in a frame, its middle at x, with a step."""
     width, height = size
     left = x - width / 2
     return [
-        flat(wall.quads(left - 0.12, 0.0, width + 0.24, height + 0.14, 0.03), look.stone[0], levels=NEAR),
-        flat(wall.quads(left, 0.04, width, height, 0.05), look.pick("door"), levels=VISIBLE),
+        flat(wall.quads(left - 0.12, 0.0, width + 0.24, height + 0.14, 0.03), materials.stone[0], levels=NEAR),
+        flat(wall.quads(left, 0.04, width, height, 0.05), materials.pick("door"), levels=VISIBLE),
     ]
 
 
@@ -307,13 +309,13 @@ def flat_roof(
     x: tuple[float, float],
     y: tuple[float, float],
     z: float,
-    look: TownMaterials,
+    materials: TownMaterials,
     *,
     coping: int,
     plant: int = 2,
 ) -> list[TrianglePiece]:
     """A flat roof with a parapet above z and boxes of building services."""
-    rng = look.generator
+    rng = materials.generator
     # m, thickness of the parapet
     thickness = 0.3
     lower_corners = np.array(
@@ -335,18 +337,18 @@ def flat_roof(
     upper_corners[:, 2] = z + PARAPET
     parts = [box(lower_corners, upper_corners, coping, levels=VISIBLE)]
     deck = [[x[0], y[0], z + 0.1], [x[1], y[0], z + 0.1], [x[1], y[1], z + 0.1], [x[0], y[1], z + 0.1]]
-    parts.append(flat(np.array([deck]), look.flat_roof, levels=ALL))
+    parts.append(flat(np.array([deck]), materials.flat_roof, levels=ALL))
     for _ in range(plant):
         width, depth, height = rng.uniform(1.5, 4.0), rng.uniform(1.5, 3.5), rng.uniform(0.9, 2.4)
         if x[1] - x[0] < width + 3.0 or y[1] - y[0] < depth + 3.0:
             continue
         left, front = rng.uniform(x[0] + 1.0, x[1] - width - 1.0), rng.uniform(y[0] + 1.0, y[1] - depth - 1.0)
-        parts.append(box((left, front, z), (left + width, front + depth, z + height), look.metal, levels=VISIBLE))
+        parts.append(box((left, front, z), (left + width, front + depth, z + height), materials.metal, levels=VISIBLE))
     return parts
 
 
 def balcony(
-    wall: Wall, x: F64, z: F64, widths: float, look: TownMaterials, *, depth: float = 1.2
+    wall: Wall, x: F64, z: F64, widths: float, materials: TownMaterials, *, depth: float = 1.2
 ) -> list[TrianglePiece]:
     """Balconies: slabs and railings before a wall, left edges x [n], floors at z [n]."""
     count = len(x)
@@ -360,7 +362,7 @@ def balcony(
         np.stack([start - slab_height, end - slab_height, end, start], axis=1) for start, end in pairwise(slab_corners)
     ]
     quads += [np.stack(slab_corners, axis=1), np.stack([start - slab_height for start in slab_corners[::-1]], axis=1)]
-    parts = [flat(np.concatenate(quads), look.stone[1], levels=VISIBLE)]
+    parts = [flat(np.concatenate(quads), materials.stone[1], levels=VISIBLE)]
     railing_faces = [
         np.stack([start + 0.12 * UP, end + 0.12 * UP, end + rail_height, start + rail_height], axis=1)
         for start, end in pairwise(slab_corners)
@@ -370,6 +372,6 @@ def balcony(
     inner_faces = [
         (side - 0.04 * direction)[:, ::-1] for side, direction in zip(railing_faces, directions, strict=True)
     ]
-    railing = look.frame[1] if look.generator.random() < 0.5 else look.glass[3]
+    railing = materials.frame[1] if materials.generator.random() < 0.5 else materials.glass[3]
     parts.append(flat(np.concatenate(railing_faces + inner_faces), railing, levels=VISIBLE))
     return parts

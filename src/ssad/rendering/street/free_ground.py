@@ -35,7 +35,7 @@ class FreeGround:
         ny, nx = self.occupied.shape
         return np.clip(cell[:, 1], 0, ny - 1), np.clip(cell[:, 0], 0, nx - 1)
 
-    def free(self, xy: npt.ArrayLike, *, distance: float) -> bool:
+    def is_free(self, xy: npt.ArrayLike, *, distance: float) -> bool:
         """Return whether all points [n, 2] are in the town, `distance` m from road and sidewalk, and not occupied."""
         points = np.asarray(xy, np.float64).reshape(-1, 2)
         # 2 m inside the raster: `_cells` clips and would test the wrong cells outside.
@@ -47,11 +47,11 @@ class FreeGround:
             return False
         return bool((self.ground.at(self.ground.paved, points) >= distance).all())
 
-    def take(self, points: npt.ArrayLike) -> None:
+    def occupy(self, points: npt.ArrayLike) -> None:
         """Mark the ground under points [n, 2] as occupied."""
         self.occupied[self._cells(np.asarray(points, np.float64).reshape(-1, 2))] = True
 
-    def clear(self, xy: npt.ArrayLike, *, size: float = 0.3, crossing: float = 1.5) -> bool:
+    def is_clear(self, xy: npt.ArrayLike, *, size: float = 0.3, crossing: float = 1.5) -> bool:
         """Return whether an object may stand at points on a sidewalk or beside it.
 
         It must be `KEEP` away from driving lanes and junctions, on ground that is not occupied.
@@ -64,9 +64,9 @@ class FreeGround:
         points = np.asarray(xy, np.float64).reshape(-1, 2)
         if (self.ground.at(self.ground.drive, points) < KEEP + size).any() or self.occupied[self._cells(points)].any():
             return False
-        return bool((self.crossing(points) > crossing + size).all())
+        return bool((self.crosswalk_distance(points) > crossing + size).all())
 
-    def crossing(self, xy: npt.ArrayLike) -> F64:
+    def crosswalk_distance(self, xy: npt.ArrayLike) -> F64:
         """Return the distance [n] from the nearest crosswalk, m."""
         points = np.asarray(xy, np.float64).reshape(-1, 2)
         distances = np.full(len(points), np.inf)
@@ -138,7 +138,7 @@ def sides(graph: LaneGraph) -> list[Side]:
         kerb = float(graph.width[graph.points(lane)].min()) if is_sidewalk else 0.0
         edge = lane_edge(graph, lane, 0.0)
         if edge.s[-1] > 4.0:
-            street_sides.append(Side(edge, kerb, is_sidewalk or not graph.divided(lane)))
+            street_sides.append(Side(edge, kerb, is_sidewalk or not graph.is_divided(lane)))
     return street_sides
 
 

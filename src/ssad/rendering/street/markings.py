@@ -31,27 +31,27 @@ _ARROW = {  # polygons of arrows along x from the tail; y to the left
 }
 
 
-def paint(soup: TriangleBuilder, graph: LaneGraph, look: TownMaterials) -> None:
+def paint_markings(triangles: TriangleBuilder, graph: LaneGraph, materials: TownMaterials) -> None:
     """All markings of the town, and wear."""
     driving_lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist()
     for lane in driving_lanes:
-        _lines(soup, graph, lane, look)
-        _wear(soup, graph, lane, look)
+        _paint_lines(triangles, graph, lane, materials)
+        _paint_wear(triangles, graph, lane, materials)
     stop_sign_lanes = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
     sign_lanes = set(graph.rule_lane.tolist())
     for signal, lane, s in zip(
         graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s.tolist(), strict=True
     ):
-        if graph.signal_virtual[signal] and lane not in sign_lanes and graph.divided(lane):
+        if graph.signal_virtual[signal] and lane not in sign_lanes and graph.is_divided(lane):
             continue  # the ring of a roundabout, a motorway
         if graph.kind[lane] == LaneType.DRIVING:
             give_way = bool(graph.signal_virtual[signal]) and lane not in stop_sign_lanes
-            _stop(soup, graph, lane, s, give_way=give_way, look=look)
+            _paint_stop_line(triangles, graph, lane, s, give_way=give_way, materials=materials)
     for crosswalk in range(len(graph.crosswalk_offset) - 1):
-        _crosswalk(soup, graph.crosswalk(crosswalk).astype(np.float64), look)
+        _paint_crosswalk(triangles, graph.crosswalk(crosswalk).astype(np.float64), materials)
 
 
-def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
+def _paint_lines(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materials: TownMaterials) -> None:
     """Lines at both sides of a lane; a line between two lanes is painted by the lower of them."""
     for share, marking, neighbour in (
         (1.0, int(graph.left_marking[lane]), int(graph.left[lane])),
@@ -60,20 +60,20 @@ def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMateria
         shares_line = neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING
         if marking in (Marking.NONE, Marking.CURB) or (shares_line and neighbour < lane):
             continue
-        oncoming = shares_line and not graph.same_direction(lane, neighbour)
-        material = look.centre if oncoming else look.white
+        oncoming = shares_line and not graph.is_same_direction(lane, neighbour)
+        material = materials.centre if oncoming else materials.white
         edge = _between_crosswalks(graph, lane_edge(graph, lane, share))
         if edge is None:
             continue
         # Lines between a lane and the shoulder lie within the lane.
         inset = 0.0 if shares_line else (0.06 + LINE / 2) * (1.0 if share == 0.0 else -1.0)
         if marking == Marking.BROKEN:
-            _dashes(soup, edge, inset, material)
+            _paint_dashes(triangles, edge, inset, material)
         elif marking == Marking.DOUBLE:
-            for aside in (-LINE, LINE):
-                _strip(soup, edge, aside, material)
+            for lateral in (-LINE, LINE):
+                _paint_strip(triangles, edge, lateral, material)
         else:
-            _strip(soup, edge, inset, material)
+            _paint_strip(triangles, edge, inset, material)
 
 
 def _between_crosswalks(graph: LaneGraph, edge: Edge) -> Edge | None:
@@ -100,16 +100,16 @@ def _between_crosswalks(graph: LaneGraph, edge: Edge) -> Edge | None:
     return Edge(edge.lane, xy, yaw, s - lower)
 
 
-def _strip(
-    soup: TriangleBuilder, edge: Edge, offset: float, material: int, *, width: float = LINE, z: float = PAINT
+def _paint_strip(
+    triangles: TriangleBuilder, edge: Edge, offset: float, material: int, *, width: float = LINE, z: float = PAINT
 ) -> None:
     """A line along an edge, `offset` m to its left."""
     centre_line = edge.xy + offset * edge.normal
     half_width = 0.5 * width * edge.normal
-    soup.add(ribbon(centre_line + half_width, centre_line - half_width, (z, z), material, levels=VISIBLE))
+    triangles.add(ribbon(centre_line + half_width, centre_line - half_width, (z, z), material, levels=VISIBLE))
 
 
-def _dashes(soup: TriangleBuilder, edge: Edge, offset: float, material: int) -> None:
+def _paint_dashes(triangles: TriangleBuilder, edge: Edge, offset: float, material: int) -> None:
     """Dashes that begin and end with half a space."""
     period = DASH + SPACE
     count = max(1, round(float(edge.s[-1]) / period))
@@ -125,16 +125,24 @@ def _dashes(soup: TriangleBuilder, edge: Edge, offset: float, material: int) -> 
         np.stack([right[:, column], right[:, column + 1], left[:, column + 1], left[:, column]], axis=1)
         for column in range(2)
     ]
-    _paint(soup, np.concatenate(quads), material)
+    _add_polygons(triangles, np.concatenate(quads), material)
 
 
-def _paint(soup: TriangleBuilder, corners: F64, material: int, *, z: float = PAINT, levels: int = VISIBLE) -> None:
+def _add_polygons(
+    triangles: TriangleBuilder, corners: F64, material: int, *, z: float = PAINT, levels: int = VISIBLE
+) -> None:
     """Flat polygons [n, k, 2] on the road."""
-    soup.add(flat(np.concatenate([corners, np.full((*corners.shape[:2], 1), z)], axis=2), material, levels=levels))
+    triangles.add(flat(np.concatenate([corners, np.full((*corners.shape[:2], 1), z)], axis=2), material, levels=levels))
 
 
-def _stop(
-    soup: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: float, *, give_way: bool, look: TownMaterials
+def _paint_stop_line(
+    triangles: TriangleBuilder,
+    graph: LaneGraph,
+    lane: int,
+    arc_length: float,
+    *,
+    give_way: bool,
+    materials: TownMaterials,
 ) -> None:
     """A stop line across a lane, or the teeth of a give-way line; and arrows on multi-lane arms.
 
@@ -145,22 +153,24 @@ def _stop(
     if give_way:
         tooth_offsets = np.arange(-half_width, half_width - 0.3, 0.75)[:, None, None]
         tooth = np.array([[0.5, 0.0], [0.5, 0.44], [0.0, 0.22]])
-        _paint(soup, place((x, y, yaw), tooth + tooth_offsets * [0.0, 1.0]), look.white)
+        _add_polygons(triangles, place((x, y, yaw), tooth + tooth_offsets * [0.0, 1.0]), materials.white)
     else:
         bar = np.array([[[0.0, -half_width], [STOP, -half_width], [STOP, half_width], [0.0, half_width]]])
-        _paint(soup, place((x, y, yaw), bar), look.white)
+        _add_polygons(triangles, place((x, y, yaw), bar), materials.white)
     neighbours = [int(neighbour) for neighbour in (graph.left[lane], graph.right[lane]) if neighbour >= 0]
     if (
         any(
-            graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
+            graph.kind[neighbour] == LaneType.DRIVING and graph.is_same_direction(lane, neighbour)
             for neighbour in neighbours
         )
         and arc_length > 30.0
     ):
-        _arrows(soup, graph, lane, arc_length, look)
+        _paint_arrows(triangles, graph, lane, arc_length, materials)
 
 
-def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: float, look: TownMaterials) -> None:
+def _paint_arrows(
+    triangles: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: float, materials: TownMaterials
+) -> None:
     """Arrows for the turns that a lane leads to, twice before the stop line."""
     directions = set()
     for successor in graph.successors(lane).tolist():
@@ -174,10 +184,10 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: floa
                 polygon_points = np.array([polygon])
                 if direction == "right":
                     polygon_points = polygon_points[:, ::-1] * [1.0, -1.0]
-                _paint(soup, place((x, y, yaw), polygon_points), look.white)
+                _add_polygons(triangles, place((x, y, yaw), polygon_points), materials.white)
 
 
-def _crosswalk(soup: TriangleBuilder, corners: F64, look: TownMaterials) -> None:
+def _paint_crosswalk(triangles: TriangleBuilder, corners: F64, materials: TownMaterials) -> None:
     """Bars along the traffic, over a rectangle [4, 2]: along its shorter sides."""
     if len(corners) != 4:
         return
@@ -196,25 +206,25 @@ def _crosswalk(soup: TriangleBuilder, corners: F64, look: TownMaterials) -> None
     # Faces must be counter-clockwise seen from above, whichever way the rectangle runs.
     if along[0] * unit[1] - along[1] * unit[0] < 0.0:
         quads = quads[:, ::-1]
-    _paint(soup, quads, look.white)
+    _add_polygons(triangles, quads, materials.white)
 
 
-def _wear(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
+def _paint_wear(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materials: TownMaterials) -> None:
     """Lighter wheel tracks, repaired patches and manholes on a lane."""
-    rng = look.generator
+    rng = materials.generator
     for share in (0.27, 0.73):
-        _strip(soup, lane_edge(graph, lane, share), 0.0, look.worn, width=0.5, z=0.5 * WEAR)
+        _paint_strip(triangles, lane_edge(graph, lane, share), 0.0, materials.worn_paint, width=0.5, z=0.5 * WEAR)
     length = float(graph.length[lane])
     for _ in range(rng.poisson(length / 45.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(2.0, max(2.1, length - 6.0))))
         patch_length, patch_width = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
-        aside = rng.uniform(-0.5, 0.5) * (width - patch_width)
-        lower, upper = aside - patch_width / 2, aside + patch_width / 2
+        lateral = rng.uniform(-0.5, 0.5) * (width - patch_width)
+        lower, upper = lateral - patch_width / 2, lateral + patch_width / 2
         patch = np.array([[[0.0, lower], [patch_length, lower], [patch_length, upper], [0.0, upper]]])
-        _paint(soup, place((x, y, yaw), patch), look.patch, z=WEAR, levels=NEAR)
+        _add_polygons(triangles, place((x, y, yaw), patch), materials.patch, z=WEAR, levels=NEAR)
     angles = np.arange(8) * np.pi / 4
     disc = 0.32 * np.stack([np.cos(angles), np.sin(angles)], axis=1)[None]
     for _ in range(rng.poisson(length / 40.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(1.0, max(1.1, length - 1.0))))
         cover = place((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width]))
-        _paint(soup, cover, look.iron, z=1.4 * WEAR, levels=NEAR)
+        _add_polygons(triangles, cover, materials.iron, z=1.4 * WEAR, levels=NEAR)

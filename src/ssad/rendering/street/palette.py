@@ -215,7 +215,7 @@ class TownMaterials:
         brightness = self.generator.uniform(0.9, 1.12)
         self.asphalt = add("asphalt", np.array(ASPHALT) * brightness, gloss=0.15)
         self.patch = add("asphalt_patch", np.array([0.055, 0.055, 0.058]) * brightness, gloss=0.2)
-        self.worn = add("asphalt_worn", np.array([0.097, 0.096, 0.098]) * brightness, gloss=0.12)
+        self.worn_paint = add("asphalt_worn", np.array([0.097, 0.096, 0.098]) * brightness, gloss=0.12)
         self.slab = add("paving", self._jitter((0.27, 0.255, 0.235), 0.06))
         self.kerb = add("kerb", self._jitter((0.37, 0.365, 0.35), 0.04))
         self.drive = add("driveway", self._jitter((0.22, 0.20, 0.185), 0.08))

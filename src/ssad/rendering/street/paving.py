@@ -78,28 +78,28 @@ def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, leve
     )
 
 
-def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: TownMaterials) -> None:
+def pave_ground(triangles: TriangleBuilder, graph: LaneGraph, ground: Ground, materials: TownMaterials) -> None:
     """Road surface, sidewalks and kerbs, earth, far ground."""
     origin = np.array(ground.origin)
     vertices, faces = region_mesh(ground.road[::2, ::2] - 0.3)
-    soup.add(level_ground(origin + 2.0 * vertices, faces, np.zeros(len(vertices)), look.asphalt))
+    triangles.add(level_ground(origin + 2.0 * vertices, faces, np.zeros(len(vertices)), materials.asphalt))
     for lane in np.flatnonzero(np.isin(graph.kind, [int(lane_kind) for lane_kind in WALK])).tolist():
-        _sidewalk(soup, graph, lane, look)
+        _pave_sidewalk(triangles, graph, lane, materials)
     vertices, faces = region_mesh(-0.7 - ground.open()[::4, ::4], largest=8)
     xy = origin + 4.0 * vertices
     road, walk = ground.at(ground.road, xy), ground.at(ground.walk, xy)
     bare_height = BELOW + (EARTH - BELOW) * np.clip((road - 0.5) / 4.0, 0.0, 1.0)
     face_cells = np.round(xy[faces].mean(axis=1) - origin).astype(int)
     is_town_ground = ground.inner | (ground.paved < 2.5)
-    soup.add(
+    triangles.add(
         level_ground(
             xy,
             faces,
             np.where(walk <= road + 0.05, EARTH, bare_height),
-            np.where(is_town_ground[face_cells[:, 1], face_cells[:, 0]], look.earth, look.earth_far),
+            np.where(is_town_ground[face_cells[:, 1], face_cells[:, 0]], materials.earth, materials.earth_far),
         )
     )
-    _far(soup, ground, look)
+    _add_far_ground(triangles, ground, materials)
 
 
 def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) -> TrianglePiece:
@@ -115,7 +115,7 @@ def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) ->
     )
 
 
-def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
+def _pave_sidewalk(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materials: TownMaterials) -> None:
     """A raised strip: kerb stones and their face along the road, slabs, and faces at the back and at free ends."""
     right, left = lane_edge(graph, lane, 0.0), lane_edge(graph, lane, 1.0)
     if float(graph.width[graph.points(lane)].max()) < 0.3:
@@ -127,16 +127,16 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMate
         if neighbour < 0:
             # The back: a face down to the earth.
             heights = (0.0, KERB) if side > 0 else (KERB, 0.0)
-            soup.add(ribbon(edge, edge, heights, look.slab))
+            triangles.add(ribbon(edge, edge, heights, materials.slab))
             slab_edges.append(edge)
             continue
         top = (edge, inner_line) if side > 0 else (inner_line, edge)
-        soup.add(ribbon(*top, (KERB, KERB), look.kerb))
+        triangles.add(ribbon(*top, (KERB, KERB), materials.kerb))
         base_line = edge + side * 0.02 * left.normal
         face_lines = (base_line, edge) if side > 0 else (edge, base_line)
-        soup.add(ribbon(*face_lines, (-0.02, KERB) if side > 0 else (KERB, -0.02), look.kerb))
+        triangles.add(ribbon(*face_lines, (-0.02, KERB) if side > 0 else (KERB, -0.02), materials.kerb))
         slab_edges.append(inner_line)
-    soup.add(ribbon(slab_edges[0], slab_edges[1], (KERB, KERB), look.slab))
+    triangles.add(ribbon(slab_edges[0], slab_edges[1], (KERB, KERB), materials.slab))
     for neighbours, end_index, corner_order in (
         (graph.predecessors(lane), 0, (0, 1)),
         (graph.successors(lane), -1, (1, 0)),
@@ -147,10 +147,10 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMate
                 (left.xy[end_index], right.xy[end_index])[corner_order[1]],
             )
             corners = [[*first_corner, -0.02], [*second_corner, -0.02], [*second_corner, KERB], [*first_corner, KERB]]
-            soup.add(flat(np.array([corners]), look.kerb))
+            triangles.add(flat(np.array([corners]), materials.kerb))
 
 
-def _far(soup: TriangleBuilder, ground: Ground, look: TownMaterials) -> None:
+def _add_far_ground(triangles: TriangleBuilder, ground: Ground, materials: TownMaterials) -> None:
     """Ground to the horizon and two rows of hills, in every view."""
     x0, y0 = np.array(ground.origin) + 1.0
     x1, y1 = np.array(ground.origin) + np.array(ground.paved.shape[::-1]) - 2.0
@@ -171,17 +171,17 @@ def _far(soup: TriangleBuilder, ground: Ground, look: TownMaterials) -> None:
         rings.append(centre + radius * offsets / np.hypot(*offsets.T)[:, None])
     for lower_ring, upper_ring in pairwise(rings):
         inner_line, outer_line = np.vstack([lower_ring, lower_ring[:1]]), np.vstack([upper_ring, upper_ring[:1]])
-        soup.add(ribbon(inner_line, outer_line, (EARTH - 0.04, EARTH - 0.04), look.earth_far), HORIZON_OWNER)
+        triangles.add(ribbon(inner_line, outer_line, (EARTH - 0.04, EARTH - 0.04), materials.earth_far), HORIZON_OWNER)
     # A plane under everything keeps the sky from showing through between two triangles.
     corners = [[x0, y0, -0.4], [x1, y0, -0.4], [x1, y1, -0.4], [x0, y1, -0.4]]
-    soup.add(flat(np.array([corners]), look.earth_far), HORIZON_OWNER)
+    triangles.add(flat(np.array([corners]), materials.earth_far), HORIZON_OWNER)
     town_radius = float(np.hypot(*offsets.T).max())
     angles = np.linspace(0.0, 2.0 * np.pi, 97)
     for radius, height, material in (
-        (town_radius + 350.0, 16.0, look.hill_near),
-        (town_radius + 1400.0, 90.0, look.hill_far),
+        (town_radius + 350.0, 16.0, materials.hill_near),
+        (town_radius + 1400.0, 90.0, materials.hill_far),
     ):
-        phases = look.generator.uniform(0.0, 2.0 * np.pi, 5)
+        phases = materials.generator.uniform(0.0, 2.0 * np.pi, 5)
         skyline = sum(
             np.sin(frequency * angles + phase_shift) / frequency**0.5
             for frequency, phase_shift in zip((2, 3, 5, 9, 14), phases, strict=True)
@@ -193,7 +193,7 @@ def _far(soup: TriangleBuilder, ground: Ground, look: TownMaterials) -> None:
             np.column_stack([base_line, 0.0 * crest_heights]),
             np.column_stack([crest_line, np.maximum(crest_heights, 0.2 * height)]),
         )
-        soup.add(
+        triangles.add(
             flat(np.stack([lower_ring[1:], lower_ring[:-1], upper_ring[:-1], upper_ring[1:]], axis=1), material),
             HORIZON_OWNER,
         )

@@ -14,7 +14,7 @@ from ssad.rendering.street.triangles import TrianglePiece, box, cylinder, join, 
 VISIBLE = NEAR | MID
 
 
-def _ball() -> tuple[F64, np.ndarray]:
+def _icosahedron() -> tuple[F64, np.ndarray]:
     """Return the unit vertices [12, 3] and faces [20, 3] of an icosahedron."""
     golden_ratio = (1.0 + 5.0**0.5) / 2.0
     vertices = np.array(
@@ -61,14 +61,14 @@ def _ball() -> tuple[F64, np.ndarray]:
     return vertices / np.linalg.norm(vertices[0]), faces
 
 
-BALL, BALL_FACES = _ball()
+BALL, BALL_FACES = _icosahedron()
 
 
 def blob(
-    centre: F64, radius: F64, material: int, look: TownMaterials, *, levels: int, rough: float = 0.14
+    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14
 ) -> TrianglePiece:
     """An uneven ellipsoid of 20 triangles, shaded smooth."""
-    rng = look.generator
+    rng = materials.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
     directions = BALL @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -77,10 +77,10 @@ def blob(
 
 
 def leaves(
-    centre: F64, radius: F64, look: TownMaterials, *, count: int, size: float, materials: list[int]
+    centre: F64, radius: F64, style_materials: TownMaterials, *, count: int, size: float, materials: list[int]
 ) -> TrianglePiece:
     """Triangles about `size` m on an ellipsoid, tilted at random, with their outsides away from its centre."""
-    rng = look.generator
+    rng = style_materials.generator
     positions = np.arange(count) + 0.5
     z = 1.0 - 1.85 * positions / count  # few leaves at the underside
     # Golden-angle spiral: an even distribution for any number of leaves.
@@ -98,7 +98,7 @@ def leaves(
     material_index = np.clip(
         (0.5 * (1.0 - z) * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1
     )
-    return _scraps(
+    return _leaf_triangles(
         centres,
         leaf_normals,
         side_axes,
@@ -109,41 +109,47 @@ def leaves(
     )
 
 
-def _scraps(  # noqa: PLR0917
-    place: F64, out: F64, side: F64, half: F64 | float, turns: tuple[float, ...], normal: F64, material: npt.ArrayLike
+def _leaf_triangles(  # noqa: PLR0917
+    place: F64,
+    outward: F64,
+    side: F64,
+    half: F64 | float,
+    turns: tuple[float, ...],
+    normal: F64,
+    material: npt.ArrayLike,
 ) -> TrianglePiece:
-    """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
+    """A triangle about each place [n, 3]: across `outward` (unit), its corners turned from `side`, `half` m away."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     cosines, sines = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
-    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(out, side)[:, None])
+    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(outward, side)[:, None])
     faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
     return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 
 
-def _greens(kind: str, look: TownMaterials) -> list[int]:
+def _greens(kind: str, materials: TownMaterials) -> list[int]:
     """Three greens of a kind, light to dark."""
-    entries = list(look.palette.table)
-    indices = look.generator.choice(look.leaves[kind], 3, replace=False).tolist()
+    entries = list(materials.palette.table)
+    indices = materials.generator.choice(materials.leaves[kind], 3, replace=False).tolist()
     return sorted(indices, key=lambda index: -sum(entries[index].colour))
 
 
-def tree(kind: str, look: TownMaterials) -> TrianglePiece:
+def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
     """A tree of a kind (round, tall, birch, conifer), its trunk at the origin; 5 to 14 m tall."""
-    rng = look.generator
+    rng = materials.generator
     if kind == "conifer":
-        return _conifer(look)
-    greens = _greens(kind, look)
-    dark_green = look.palette.shade(greens[-1], 0.6)
+        return _conifer(materials)
+    greens = _greens(kind, materials)
+    dark_green = materials.palette.shade(greens[-1], 0.6)
     height = {"round": rng.uniform(6.0, 9.5), "tall": rng.uniform(9.0, 13.5), "birch": rng.uniform(7.5, 11.0)}[kind]
     radius_shares = {"round": (0.34, 0.36), "tall": (0.15, 0.42), "birch": (0.20, 0.36)}[kind]
     radius = np.array([radius_shares[0], radius_shares[0], radius_shares[1]]) * height * rng.uniform(0.9, 1.12, 3)
     centre = np.array([0.0, 0.0, height - radius[2]])
     trunk_radius = 0.020 * height if kind != "birch" else 0.013 * height
-    bark = look.bark[1] if kind == "birch" else look.bark[0]
+    bark = materials.bark[1] if kind == "birch" else materials.bark[0]
     parts = [
         cylinder((trunk_radius, 0.55 * trunk_radius), (-0.1, 0.75 * height), bark, sides=6, levels=VISIBLE),
         cylinder((trunk_radius, 0.6 * trunk_radius), (-0.1, 0.6 * height), bark, sides=3, levels=FAR),
-        blob(centre, 0.98 * radius, greens[1], look, levels=FAR, rough=0.1),
+        blob(centre, 0.98 * radius, greens[1], materials, levels=FAR, rough=0.1),
     ]
     lobe_count = {"round": 3, "tall": 2, "birch": 3}[kind]
     leaf_count = {"round": 32, "tall": 38, "birch": 26}[kind]
@@ -152,12 +158,12 @@ def tree(kind: str, look: TownMaterials) -> TrianglePiece:
         height_offset = (lobe_index / max(lobe_count - 1, 1) - 0.5) * 0.7
         lobe_offset = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), height_offset]) * radius
         lobe_radius = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
-        parts.append(blob(centre + lobe_offset, 0.9 * lobe_radius, dark_green, look, levels=VISIBLE))
+        parts.append(blob(centre + lobe_offset, 0.9 * lobe_radius, dark_green, materials, levels=VISIBLE))
         parts.append(
             leaves(
                 centre + lobe_offset,
                 lobe_radius,
-                look,
+                materials,
                 count=leaf_count,
                 size=0.33 * float(lobe_radius.mean()),
                 materials=greens,
@@ -166,14 +172,14 @@ def tree(kind: str, look: TownMaterials) -> TrianglePiece:
     return join(parts)
 
 
-def _conifer(look: TownMaterials) -> TrianglePiece:
+def _conifer(materials: TownMaterials) -> TrianglePiece:
     """Whorls of branches as cones with ragged rims."""
-    rng, greens = look.generator, _greens("conifer", look)
+    rng, greens = materials.generator, _greens("conifer", materials)
     height = rng.uniform(7.5, 13.0)
     base_radius = height * rng.uniform(0.17, 0.24)
     parts = [
         cylinder(
-            (0.018 * height, 0.012 * height), (-0.1, 0.3 * height), look.bark[0], sides=5, levels=NEAR | MID | FAR
+            (0.018 * height, 0.012 * height), (-0.1, 0.3 * height), materials.bark[0], sides=5, levels=NEAR | MID | FAR
         ),
         cylinder((base_radius, 0.0), (0.14 * height, height), greens[1], sides=6, levels=FAR),
     ]
@@ -209,29 +215,29 @@ def _conifer(look: TownMaterials) -> TrianglePiece:
         lower_faces = np.stack([(indices + 1) % side_count, indices, np.full(side_count, side_count)], 1)
         lower_normals = np.broadcast_to([0.0, 0.0, -1.0], lower_vertices.shape)
         parts.append(
-            smooth(lower_vertices, lower_faces, lower_normals, look.palette.shade(greens[2], 0.6), levels=NEAR)
+            smooth(lower_vertices, lower_faces, lower_normals, materials.palette.shade(greens[2], 0.6), levels=NEAR)
         )
     return join(parts)
 
 
-def bush(look: TownMaterials) -> TrianglePiece:
+def bush(materials: TownMaterials) -> TrianglePiece:
     """A bush about 1.2 m tall."""
-    rng = look.generator
-    greens = _greens(str(rng.choice(["round", "tall", "birch"])), look)
+    rng = materials.generator
+    greens = _greens(str(rng.choice(["round", "tall", "birch"])), materials)
     radius = np.array([0.7, 0.7, 0.6]) * rng.uniform(0.8, 1.2, 3)
     centre = np.array([0.0, 0.0, 0.85 * radius[2]])
     return join(
         [
-            blob(centre, 0.92 * radius, look.palette.shade(greens[-1], 0.7), look, levels=VISIBLE),
-            leaves(centre, radius, look, count=36, size=0.22, materials=greens),
+            blob(centre, 0.92 * radius, materials.palette.shade(greens[-1], 0.7), materials, levels=VISIBLE),
+            leaves(centre, radius, materials, count=36, size=0.22, materials=greens),
         ]
     )
 
 
-def hedge(look: TownMaterials, material: int) -> TrianglePiece:
+def hedge(materials: TownMaterials, material: int) -> TrianglePiece:
     """A metre of hedge along x, 0.7 m thick and 1 m tall; scale it."""
-    rng = look.generator
-    light_green = look.palette.shade(material, 1.5)
+    rng = materials.generator
+    light_green = materials.palette.shade(material, 1.5)
     parts = [box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), material, levels=VISIBLE)]
     leaf_count = 15
     centres = np.column_stack(
@@ -245,6 +251,8 @@ def hedge(look: TownMaterials, material: int) -> TrianglePiece:
     side_axes = cross(leaf_normals, [0.3, 0.2, 0.9])
     leaf_materials = np.where(rng.random(leaf_count) < 0.5, light_green, material)
     parts.append(
-        _scraps(centres, leaf_normals, side_axes, 0.12, (0.0, 2.1, 4.2), np.repeat(outwards, 3, axis=0), leaf_materials)
+        _leaf_triangles(
+            centres, leaf_normals, side_axes, 0.12, (0.0, 2.1, 4.2), np.repeat(outwards, 3, axis=0), leaf_materials
+        )
     )
     return join(parts)

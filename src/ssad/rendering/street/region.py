@@ -157,9 +157,9 @@ def region_mesh(field: Grid, *, largest: int = 16) -> tuple[F64, I32]:
     Returns:
         Vertices [V, 2] in cells, and faces [F, 3].
     """
-    inside = field < 0.0
+    is_inside = field < 0.0
     ny, nx = field.shape[0] - 1, field.shape[1] - 1
-    corners = np.stack([inside[:-1, :-1], inside[:-1, 1:], inside[1:, 1:], inside[1:, :-1]])
+    corners = np.stack([is_inside[:-1, :-1], is_inside[:-1, 1:], is_inside[1:, 1:], is_inside[1:, :-1]])
     is_full, is_touched = corners.all(axis=0), corners.any(axis=0)
     leaves: list[tuple[int, I32]] = []
     uncovered = is_full.copy()
@@ -178,10 +178,10 @@ def region_mesh(field: Grid, *, largest: int = 16) -> tuple[F64, I32]:
     mixed_cells = np.argwhere(is_touched & ~is_full).astype(np.int32)
     for dy, dx in ((0, 0), (0, 1), (1, 1), (1, 0)):
         node_ids = mixed_cells + np.array([dy, dx], np.int32)
-        node_inside = inside[node_ids[:, 0], node_ids[:, 1]]
+        node_inside = is_inside[node_ids[:, 0], node_ids[:, 1]]
         is_vertex[node_ids[node_inside, 0], node_ids[node_inside, 1]] = True
     faces = [_squares(is_vertex, side, cells) for side, cells in leaves if len(cells)]
-    edge_faces, crossing_points = _edges(field, inside, mixed_cells)
+    edge_faces, crossing_points = _edges(field, is_inside, mixed_cells)
     if len(mixed_cells):
         faces.append(edge_faces)
     all_faces = np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
@@ -196,9 +196,9 @@ def region_mesh(field: Grid, *, largest: int = 16) -> tuple[F64, I32]:
     return vertices, np.asarray(inverse).reshape(-1, 3).astype(np.int32)
 
 
-def _squares(used: npt.NDArray[np.bool_], k: int, at: I32) -> npt.NDArray[np.int64]:
+def _squares(is_used: npt.NDArray[np.bool_], k: int, at: I32) -> npt.NDArray[np.int64]:
     """Triangles of squares of k cells with corners at [n, 2] (row, column): two, or a fan by finer neighbours."""
-    row_length = used.shape[1]
+    row_length = is_used.shape[1]
     steps = np.arange(k)
     border = np.concatenate(
         [
@@ -210,7 +210,7 @@ def _squares(used: npt.NDArray[np.bool_], k: int, at: I32) -> npt.NDArray[np.int
     )
     nodes = at[:, None, :].astype(np.int64) + border[None]
     node_ids = nodes[..., 0] * row_length + nodes[..., 1]
-    is_vertex = used[nodes[..., 0], nodes[..., 1]]
+    is_vertex = is_used[nodes[..., 0], nodes[..., 1]]
     is_plain = is_vertex.sum(axis=1) == 4
     corner_ids = node_ids[is_plain][:, [0, k, 2 * k, 3 * k]]
     faces = [corner_ids[:, [0, 1, 2]], corner_ids[:, [0, 2, 3]]]
@@ -228,7 +228,7 @@ def _squares(used: npt.NDArray[np.bool_], k: int, at: I32) -> npt.NDArray[np.int
     return np.concatenate(faces)
 
 
-def _edges(field: Grid, inside: npt.NDArray[np.bool_], mixed: I32) -> tuple[npt.NDArray[np.int64], F64]:
+def _edges(field: Grid, is_inside: npt.NDArray[np.bool_], mixed: I32) -> tuple[npt.NDArray[np.int64], F64]:
     """Triangulate the cells that the zero line crosses.
 
     Crossing 2 * node lies on the edge to the right of a node, 2 * node + 1 on the edge above it.
@@ -250,7 +250,7 @@ def _edges(field: Grid, inside: npt.NDArray[np.bool_], mixed: I32) -> tuple[npt.
         node_count + 2 * corners[3],
         node_count + 2 * corners[0] + 1,
     ]
-    values, signs = field.reshape(-1), inside.reshape(-1)
+    values, signs = field.reshape(-1), is_inside.reshape(-1)
     ring_ids = np.stack(
         [
             corners[0],

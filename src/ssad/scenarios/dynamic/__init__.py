@@ -1,6 +1,6 @@
 """Dynamic scenarios: eight pre-crash classes, natural junctions, and your own in YAML."""
 
-from ssad.scenarios.dynamic.catalog import CUSTOM, PRECRASH, SCENARIOS, parameter_box, scenario_type
+from ssad.scenarios.dynamic.catalogue import CUSTOM, PRECRASH, SCENARIOS, parameter_box, scenario_type
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.importer import import_routes
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType

@@ -24,10 +24,10 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
-from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.catalogue import scenario_type
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import shifted
-from ssad.scenarios.dynamic.knowledge._remember import remembered
+from ssad.scenarios.dynamic.knowledge._placing import move_pose
 from ssad.scenarios.dynamic.sampling import sample_parameters
 from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import model
@@ -64,12 +64,14 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
     except RouteError as error:
         raise RouteError(f"scenario {scenario.name}: {error}") from None
     if spread == 0.0:
-        return _build(scenario, graph, route, seed)
+        return _build_one(scenario, graph, route, seed)
     problem = None
     for attempt in range(_ATTEMPTS):
         random = generator("scenario", scenario.name, scenario.seed, seed, "spread", attempt)
         try:
-            return _build(sample_parameters(scenario, random, spread=spread), graph, route, seed, everybody_apart=True)
+            return _build_one(
+                sample_parameters(scenario, random, spread=spread), graph, route, seed, require_clearance=True
+            )
         except RouteError as error:
             problem = error
     raise RouteError(
@@ -77,16 +79,18 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
     )
 
 
-def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, everybody_apart: bool = False) -> Episode:
+def _build_one(
+    scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, require_clearance: bool = False
+) -> Episode:
     """Return the episode of this very scenario; everybody_apart: agents at drawn positions must not touch either."""
     scenario_kind = scenario_type(scenario.type)
-    scenario = _completed(scenario, scenario_kind)
+    scenario = _fill_in_defaults(scenario, scenario_kind)
     values = scenario_kind.values(scenario.parameters)
     ego = EpisodeAgent(
         name="ego",
         model=EGO_MODEL,
         controller=Controller.EXTERNAL,
-        pose=_start(route, values["ego_longitudinal"], values["ego_lateral"], values["ego_heading"]),
+        pose=_pose_beside_route(route, values["ego_longitudinal"], values["ego_lateral"], values["ego_heading"]),
         speed=values["ego_speed"],
         target_speed=scenario.target_speed,
         route=route,
@@ -97,21 +101,21 @@ def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, eve
     other_agents = scenario_kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
     agents = (ego, *other_agents)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
-    check_all = everybody_apart and any(parameter.spread for parameter in scenario_kind.parameters)
+    check_all = require_clearance and any(parameter.spread for parameter in scenario_kind.parameters)
     _check_start(scenario, agents, movable=len(agents) if check_all else 1)
     return Episode(
         key=f"{scenario.name}@{digest(dump_json(scenario_data(scenario)), seed)[:12]}",
         scenario=scenario,
         town=scenario.town,
         agents=agents,
-        signal_override=dict(_signals(graph, route, scenario.signals, scenario_kind.whole_town)),
+        signal_override=dict(_cached_forced_signals(graph, route, scenario.signals, scenario_kind.whole_town)),
         override_until=scenario.signals.until,
         limits=scenario.limits,
         seed=seed,
     )
 
 
-@remembered()
+@cached_by_identity()
 def _route(graph: LaneGraph, keypoints: tuple[Pose, ...]) -> Route:
     """Return the route through key points; its arrays are read-only, since all its episodes share them."""
     from ssad.world.roads import route_along
@@ -122,7 +126,7 @@ def _route(graph: LaneGraph, keypoints: tuple[Pose, ...]) -> Route:
     return route
 
 
-def _start(route: Route, forward: float, left: float, turn: float) -> Pose:
+def _pose_beside_route(route: Route, forward: float, left: float, turn: float) -> Pose:
     """Return the pose `forward` m along a route and `left` m beside it, turned by `turn` rad."""
     if forward == left == turn == 0.0:
         return Pose(float(route.xy[0, 0]), float(route.xy[0, 1]), float(route.yaw[0]))
@@ -132,10 +136,10 @@ def _start(route: Route, forward: float, left: float, turn: float) -> Pose:
     yaw, next_yaw = route.yaw[index : index + 2].tolist()
     share = position - index
     bend = math.remainder(next_yaw - yaw, math.tau)
-    return shifted(Pose(x0 + share * (x1 - x0), y0 + share * (y1 - y0), yaw + share * bend), 0.0, left, turn)
+    return move_pose(Pose(x0 + share * (x1 - x0), y0 + share * (y1 - y0), yaw + share * bend), 0.0, left, turn)
 
 
-def _completed(scenario: Scenario, kind: ScenarioType) -> Scenario:
+def _fill_in_defaults(scenario: Scenario, kind: ScenarioType) -> Scenario:
     """Return the scenario with the values that it leaves at the defaults taken from its type."""
     limits = scenario.limits
     if limits.max_distance == EpisodeLimits().max_distance:
@@ -148,8 +152,10 @@ def _completed(scenario: Scenario, kind: ScenarioType) -> Scenario:
     )
 
 
-@remembered()
-def _signals(graph: LaneGraph, route: Route, plan: SignalPlan, whole_town: bool) -> dict[int, SignalState]:
+@cached_by_identity()
+def _cached_forced_signals(
+    graph: LaneGraph, route: Route, plan: SignalPlan, whole_town: bool
+) -> dict[int, SignalState]:
     """Return `forced_signals`, cached for a route."""
     return forced_signals(graph, route, plan, whole_town=whole_town)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Actor, AgentKind, Episode, EpisodeTrace, Pose, Scenario
-from ssad.scenarios.dynamic.catalog import CUSTOM, parameter_box, scenario_type
+from ssad.scenarios.dynamic.catalogue import CUSTOM, parameter_box, scenario_type
 
 CLOSE: Final = 0.002, 0.001
 """How far a row may be off the line between its neighbours to be left out, m and rad."""
@@ -19,7 +19,7 @@ BRAKING: Final = 4.0  # m/s^2 of agents that still move when the recording ends
 Rows = tuple[tuple[float, float, float, float], ...]
 
 
-def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) -> Scenario:
+def freeze_episode(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) -> Scenario:
     """Return the scenario in which every agent but the ego repeats the recording.
 
     An agent that is still moving when the recording ends brakes to a stop straight ahead and stays there. The result
@@ -44,14 +44,14 @@ def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) ->
     end_time = float(episode.limits.max_steps * trace.dt)
     actors = []
     for agent_index in range(1, len(trace.names)):
-        rows = _rows(trace, agent_index)
+        rows = _agent_rows(trace, agent_index)
         if rows is None:
             continue
         if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MIN_MOTION and bool(trace.active[:, agent_index].all()):
             # an actor without phases and trajectory stands still
             actors.append(Actor(trace.names[agent_index], trace.models[agent_index], agent_pose(rows[0])))
             continue
-        trajectory = rounded_rows(stopping(rows, end_time) if trace.active[-1, agent_index] else rows)
+        trajectory = round_rows(extend_by_stop(rows, end_time) if trace.active[-1, agent_index] else rows)
         actors.append(
             Actor(trace.names[agent_index], trace.models[agent_index], Pose(*trajectory[0][1:]), trajectory=trajectory)
         )
@@ -72,11 +72,11 @@ def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
     """Return a frozen scenario in which one actor has another motion.
 
     Args:
-        scenario: As `frozen` makes it.
+        scenario: As `freeze_episode` makes it.
         name: Of the actor.
         rows: Its time s, x, y m and yaw rad [T, 4]; at their end it brakes to a stop.
     """
-    trajectory = rounded_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
+    trajectory = round_rows(extend_by_stop(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
     pose = Pose(*trajectory[0][1:])
     return replace(
         scenario,
@@ -92,14 +92,14 @@ def agent_pose(row: F64) -> Pose:
     return Pose(round(float(row[1]), 3), round(float(row[2]), 3), round(float(wrap_angle(row[3])), 4))
 
 
-def rounded_rows(rows: F64, *, thin: bool = True) -> Rows:
+def round_rows(rows: F64, *, thin: bool = True) -> Rows:
     """Round rows [T, 4] to the precision of scenario files (mm), optionally without collinear rows."""
-    selected_rows = np.array(thinned(rows)) if thin else rows
+    selected_rows = np.array(drop_collinear_rows(rows)) if thin else rows
     rounded = np.concatenate([selected_rows[:, :3].round(3), np.asarray(wrap_angle(selected_rows[:, 3:])).round(4)], 1)
     return tuple((t, x, y, yaw) for t, x, y, yaw in rounded.tolist())
 
 
-def thinned(rows: F64) -> list[list[float]]:
+def drop_collinear_rows(rows: F64) -> list[list[float]]:
     """Drop the rows [T, 4] of time, x, y and yaw that lie on the line between their neighbours."""
     unwrapped = rows.copy()
     # Interpolation across the jump at pi would report a false deviation.
@@ -117,7 +117,7 @@ def thinned(rows: F64) -> list[list[float]]:
     return simplified
 
 
-def _rows(trace: EpisodeTrace, agent: int) -> F64 | None:
+def _agent_rows(trace: EpisodeTrace, agent: int) -> F64 | None:
     """Return time, x, y and yaw [T, 4] of an agent while it is present, or None if it never is."""
     present_rows = np.flatnonzero(trace.active[:, agent])
     if len(present_rows) < 2 or trace.kind[agent] == AgentKind.NONE:
@@ -131,7 +131,7 @@ def _rows(trace: EpisodeTrace, agent: int) -> F64 | None:
     return np.stack(columns, 1)
 
 
-def braked(speed: F64, time: F64) -> tuple[F64, F64]:
+def brake(speed: F64, time: F64) -> tuple[F64, F64]:
     """Return the distance covered (m) and the speed left (m/s) after braking from a speed for some time.
 
     Args:
@@ -144,7 +144,7 @@ def braked(speed: F64, time: F64) -> tuple[F64, F64]:
     return travelled, np.sign(speed) * (magnitude - BRAKING * braking_time)
 
 
-def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
+def extend_by_stop(rows: F64, until: float, *, step: float = 0.1) -> F64:
     """Extend rows [T, 4] of time, x, y and yaw by a stop straight ahead, until a time, s."""
     last_row, previous_row = rows[-1], rows[-2]
     heading = np.array([np.cos(last_row[3]), np.sin(last_row[3])])
@@ -152,7 +152,7 @@ def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
     braking = np.arange(1, int(abs(speed) / BRAKING / step) + 2) * step
     # One row beyond the end keeps the agent present until the last step.
     time = np.append(braking, max(until - float(last_row[0]), braking[-1]) + 1.0)
-    travelled, _ = braked(np.asarray(speed), time)
+    travelled, _ = brake(np.asarray(speed), time)
     stop_rows = np.stack(
         [last_row[0] + time, *(last_row[1:3, None] + heading[:, None] * travelled), np.full(len(time), last_row[3])], 1
     )

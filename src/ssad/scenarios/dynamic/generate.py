@@ -17,7 +17,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import Reference, check_arguments, names, resolve
 from ssad.core.types import AgentKind, Bool, Controller, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.scenarios.dynamic.outcome import measure
 
 _SEARCH = "ssad.scenarios.dynamic.search"
@@ -33,11 +33,11 @@ GENERATORS: dict[str, str] = {
     "adv-sim": "ssad.scenarios.dynamic.transition.adv_sim:AdvSim",
     "adv-traj": "ssad.scenarios.dynamic.transition.adv_traj:AdvTraj",
     "near-miss": "ssad.scenarios.dynamic.logged.near_miss:NearMisses",
-    "king": "ssad.scenarios.dynamic.transition.kinematics:King",
+    "king": "ssad.scenarios.dynamic.transition.king:King",
     "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
     "frea": "ssad.scenarios.dynamic.policy.adv_ppo:Frea",
     "adv-ddpg": "ssad.scenarios.dynamic.policy.adv_ppo:AdvDDPG",
-    "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
+    "cat": "ssad.scenarios.dynamic.transition.cat:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
 FILE_GENERATORS = "ssad.generator_files"
@@ -129,14 +129,14 @@ class Trials:
         Raises:
             SSADError: A scenario cannot be built or driven.
         """
-        driven: list[Base] = []
+        driven_traces: list[Base] = []
         for start in range(0, len(scenarios), SCENES):
             chunk = scenarios[start : start + SCENES]
             episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in chunk]
             traces, _ = self._drive(episodes, {scenario.town: graph for scenario, graph, _ in chunk}, {})
             chunk_rows = zip(episodes, chunk, traces, strict=True)
-            driven += [Base(episode, graph, trace) for episode, (_, graph, _), trace in chunk_rows]
-        return driven
+            driven_traces += [Base(episode, graph, trace) for episode, (_, graph, _), trace in chunk_rows]
+        return driven_traces
 
     def run(self, proposals: Sequence[tuple[Base, Proposal]]) -> list[Outcome]:
         """Drive proposals, each in its base's town and with its seed; a proposal that cannot be built fails."""
@@ -210,8 +210,8 @@ def search(
     *,
     budget: int,
     batch: int = BATCH,
-    known: Sequence[Sequence[Outcome]] = (),
-    after: Callable[[int], None] = lambda requested: None,
+    known_outcomes: Sequence[Sequence[Outcome]] = (),
+    on_batch_end: Callable[[int], None] = lambda requested: None,
 ) -> list[list[Outcome]]:
     """Run a generator until each base has used its budget or no more proposals come.
 
@@ -221,8 +221,8 @@ def search(
         trials: Test bench that drives the proposals.
         budget: Rollouts of each base.
         batch: Rollouts of each base per round.
-        known: Outcomes of each base from an interrupted search; these are not driven again.
-        after: Called after each round with the number of rollouts requested for each base so far.
+        known_outcomes: Outcomes of each base from an interrupted search; these are not driven again.
+        on_batch_end: Called after each round with the number of rollouts requested for each base so far.
 
     Returns:
         For each base its outcomes, in the order in which they were proposed.
@@ -231,7 +231,7 @@ def search(
         ConfigError: The generator deviates from the known outcomes, exceeds the batch, or omits a base.
     """
     collected: list[list[Outcome]] = [[] for _ in bases]
-    known = known or [[] for _ in bases]
+    known_outcomes = known_outcomes or [[] for _ in bases]
     requested = 0
     while requested < budget:
         batch_size = min(batch, budget - requested)
@@ -247,7 +247,11 @@ def search(
         requested += max(map(len, proposals))
         # A resumed search replays known outcomes, so the generator reaches the same state.
         batch_outcomes = [
-            list(known[base_index][len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)])
+            list(
+                known_outcomes[base_index][
+                    len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)
+                ]
+            )
             for base_index, base_proposals in enumerate(proposals)
         ]
         for base_index, base_proposals in enumerate(proposals):
@@ -270,7 +274,7 @@ def search(
         generator.tell(batch_outcomes)
         for base_index, outcomes in enumerate(batch_outcomes):
             collected[base_index] += outcomes
-        after(requested)
+        on_batch_end(requested)
     return collected
 
 
@@ -295,6 +299,6 @@ def scenario_of(outcome: Outcome, base: Base, *, name: str) -> Scenario:
         raise ConfigError(f"{name}: a proposal that failed is no scenario: {outcome.failure}")
     episode = build_episode(outcome.proposal.scenario, base.graph, seed=base.episode.seed)
     if outcome.proposal.drivers or episode.scenario.traffic is not None:
-        return frozen(episode, outcome.trace, name=name)
+        return freeze_episode(episode, outcome.trace, name=name)
     source = f"{base.scenario.name}, seed {base.episode.seed}"
     return replace(outcome.proposal.scenario, name=name, source=source)

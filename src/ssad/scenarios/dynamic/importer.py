@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
-from ssad.core.safeio import dotted, read_json, read_xml
+from ssad.core.safeio import format_location, read_json, read_xml
 from ssad.core.types import Pose, Scenario
-from ssad.scenarios.dynamic.catalog import PRECRASH, scenario_type
+from ssad.scenarios.dynamic.catalogue import PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
 from ssad.world.roads import load_town
 from ssad.world.roads.router import route_along
@@ -93,13 +93,13 @@ class _ImportedRoute:
     points: tuple[Pose, ...]
 
 
-def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[Scenario, ...]:
+def import_routes(folder: Path, *, omissions: list[str] | None = None) -> tuple[Scenario, ...]:
     """Import all scenarios of a folder, in its order; of several lists the longest one without parameters.
 
     Args:
         folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`,
             such as SafeBench's human.json or random.json, whose entries have parameters of their own.
-        left_out: Collects a line for each broken entry of a list, which is skipped; None: the first broken entry
+        omissions: Collects a line for each broken entry of a list, which is skipped; None: the first broken entry
             raises.
 
     Raises:
@@ -107,7 +107,7 @@ def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[S
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":
-        return _scenarios_of_list(_routes_of(folder.parent), _read_list(folder, left_out), folder, left_out)
+        return _scenarios_of_list(_routes_of(folder.parent), _read_list(folder, omissions), folder, omissions)
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder")
     lists = sorted(path for list_folder in _scenario_types(folder) for path in list_folder.glob("*.json"))
@@ -115,16 +115,16 @@ def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[S
         entries_by_list: dict[Path, tuple[list[_Entry], list[str]]] = {}
         for path in lists:
             list_errors: list[str] = []
-            entries_by_list[path] = _read_list(path, None if left_out is None else list_errors), list_errors
-        preferred_list = max(lists, key=lambda path: _preferred(entries_by_list[path][0]))
+            entries_by_list[path] = _read_list(path, None if omissions is None else list_errors), list_errors
+        preferred_list = max(lists, key=lambda path: _list_priority(entries_by_list[path][0]))
         entries, list_errors = entries_by_list[preferred_list]
-        if left_out is not None:
-            left_out += list_errors
-        return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, left_out)
+        if omissions is not None:
+            omissions += list_errors
+        return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, omissions)
     return _leaderboard(folder)
 
 
-def _preferred(entries: Sequence[_Entry]) -> tuple[bool, int]:
+def _list_priority(entries: Sequence[_Entry]) -> tuple[bool, int]:
     """Return a sort key of lists: lists without parameters first, then longer ones."""
     return bool(entries) and not any(entry.parameters for entry in entries), len(entries)
 
@@ -305,7 +305,7 @@ def _with_lane_points(road: _ImportedRoute) -> _ImportedRoute:
 
 def _check_scenario(scenario: Scenario, path: Path) -> Scenario:
     for location, message in problems(scenario):
-        raise FormatError(f"{path}: {dotted(location)}: {message}")
+        raise FormatError(f"{path}: {format_location(location)}: {message}")
     return scenario
 
 
@@ -398,7 +398,7 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
     if not isinstance(block, dict):
         raise FormatError(f"{path}: available_scenarios should hold objects that map towns to scenarios")
     for town, scenarios in block.items():
-        for scenario in _list(scenarios, f"{path}: {town}"):
+        for scenario in _as_list(scenarios, f"{path}: {town}"):
             if not isinstance(scenario, dict):
                 raise FormatError(f"{path}: {town}: expected objects with available_event_configurations")
             scenario_name = str(scenario.get("scenario_name", scenario.get("scenario_type")))
@@ -407,7 +407,7 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
                     raise FormatError(f"{path}: {town}: unknown scenario '{scenario_name}'; known: {', '.join(_NAMES)}")
                 continue
             configurations = scenario.get("available_event_configurations")
-            for index, event in enumerate(_list(configurations, f"{path}: {town}: {scenario_name}")):
+            for index, event in enumerate(_as_list(configurations, f"{path}: {town}: {scenario_name}")):
                 location = f"{path}: {town}: {scenario_name}: event {index}"
                 if not isinstance(event, dict):
                     raise FormatError(f"{location}: expected an object with a transform")
@@ -426,11 +426,11 @@ def _other_actors(event: Mapping[str, Any], location: str) -> tuple[Pose, ...]:
     return tuple(
         _pose(actor, f"{location}: other_actors: {side} {index}")
         for side in _SIDES
-        for index, actor in enumerate(_list(actors_by_side.get(side, []), f"{location}: other_actors: {side}"))
+        for index, actor in enumerate(_as_list(actors_by_side.get(side, []), f"{location}: other_actors: {side}"))
     )
 
 
-def _list(value: Any, location: str) -> list[Any]:
+def _as_list(value: Any, location: str) -> list[Any]:
     if not isinstance(value, list):
         raise FormatError(f"{location}: expected a list")
     return value

@@ -11,8 +11,8 @@ from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.criticality import boxes
-from ssad.scenarios.dynamic.knowledge._remember import remembered
+from ssad.metrics.criticality import trace_boxes
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.world.models import GRIP, model
 from ssad.world.roads.query import LaneQuery
 
@@ -40,14 +40,14 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         if agent_indices
         else np.zeros(0, np.intp)
     )
-    agent_boxes = boxes(trace)
+    agent_boxes = trace_boxes(trace)
     contact_time = impact_speed = ego_speed = None
     if len(contact_rows):
         row = int(contact_rows[0])
         contact_time, ego_speed = row * float(trace.dt), abs(float(trace.speed[row, 0]))
         impact_speed = _closing_speed(trace, row, int(trace.contact_agent[row]))
     motor_vehicles = [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.MOTORCYCLE]
-    acceleration, jerk, within_limits = _effort(
+    acceleration, jerk, within_limits = _peak_effort(
         trace, [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.BICYCLE]
     )
     return Outcome(
@@ -84,8 +84,8 @@ def _min_gap(trace: EpisodeTrace, box: F64, agents: Sequence[int]) -> float | No
     return min(gaps, default=None)
 
 
-@remembered(16)
-def _lanes(graph: LaneGraph) -> LaneQuery:
+@cached_by_identity(16)
+def _cached_lane_query(graph: LaneGraph) -> LaneQuery:
     return LaneQuery(graph)
 
 
@@ -94,7 +94,7 @@ def _leaves_road(trace: EpisodeTrace, graph: LaneGraph, agent: int) -> bool:
     present = trace.active[:, agent]
     if not present.any():
         return False
-    off_road = _lanes(graph).off_road(np.stack([trace.x[present, agent], trace.y[present, agent]], 1))
+    off_road = _cached_lane_query(graph).off_road(np.stack([trace.x[present, agent], trace.y[present, agent]], 1))
     return bool((np.diff(off_road.astype(np.int8)) > 0).any())
 
 
@@ -113,17 +113,17 @@ def _hits_others(trace: EpisodeTrace, box: F64, agent: int) -> bool:
     return False
 
 
-def _effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | None, float | None, bool | None]:
+def _peak_effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | None, float | None, bool | None]:
     """Return the largest acceleration m/s^2 and jerk m/s^3 of vehicles, and whether all respected their limits."""
     lag = max(1, round(WINDOW / trace.dt))
     max_acceleration, max_jerk, within_limits = 0.0, 0.0, True
-    measured = False
+    efforts = False
     for agent in agents:
         present_rows = np.flatnonzero(trace.active[:, agent])
         speed = trace.speed[present_rows, agent].astype(np.float64)
         if len(speed) <= lag:
             continue
-        measured = True
+        efforts = True
         body = model(trace.models[agent])
         longitudinal = (speed[lag:] - speed[:-lag]) / (lag * trace.dt)
         yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[present_rows, agent].astype(np.float64)))) / trace.dt
@@ -137,4 +137,4 @@ def _effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | None, f
             and lateral.max() <= TOLERANCE * GRIP
             and jerk.max(initial=0.0) <= TOLERANCE * MAX_JERK
         )
-    return (max_acceleration, max_jerk, within_limits) if measured else (None, None, None)
+    return (max_acceleration, max_jerk, within_limits) if efforts else (None, None, None)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import Scenario
-from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.catalogue import scenario_type
 from ssad.scenarios.dynamic.knowledge._kind import TARGET_SPEED_SPREAD
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssad.core.errors import ConfigError
-from ssad.core.safeio import Document, Location, dotted
+from ssad.core.safeio import Document, Location, format_location
 from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Scenario, SignalPlan, TrafficPlan
-from ssad.scenarios.dynamic.catalog import CUSTOM, scenario_type
+from ssad.scenarios.dynamic.catalogue import CUSTOM, scenario_type
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def check(scenario: Scenario) -> None:
         ConfigError: It is not valid; names the scenario and the key.
     """
     for location, message in problems(scenario):
-        raise ConfigError(f"scenario {scenario.name}: {dotted(location)}: {message}")
+        raise ConfigError(f"scenario {scenario.name}: {format_location(location)}: {message}")
 
 
 def _explain(error: ValidationError) -> tuple[tuple[str | int, ...], str]:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.registry import names
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 from ssad.core.types import Scenario
-from ssad.scenarios.dynamic.catalog import SCENARIOS, scenario_type
+from ssad.scenarios.dynamic.catalogue import SCENARIOS, scenario_type
 from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
@@ -57,7 +57,9 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     if ":" in ref or ref in names("scenario", SCENARIOS):
         return _of_class(ref)
     if ref.partition("/")[0] in IMPORTED:
-        raise ConfigError(f"scenario '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER")
+        raise ConfigError(
+            f"scenario '{ref}' is not in {home_folder() / 'scenarios'}; import it: ssad import routes FOLDER"
+        )
     raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *scenarios_by_name])
 
 
@@ -78,7 +80,7 @@ def _of_class(name: str) -> tuple[Scenario, ...]:
 
 def set_files() -> dict[str, Path]:
     """Return set name -> YAML file: the imported sets, then the shipped ones."""
-    imported_files = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
+    imported_files = {path.stem: path for path in sorted((home_folder() / "scenarios").glob("*.yaml"))}
     return imported_files | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
 
 

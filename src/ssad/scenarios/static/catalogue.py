@@ -123,7 +123,7 @@ class PerturbationEntry(Schema):
         return self.model_copy(update={"name": str(folder / path)})
 
     @model_serializer
-    def _as_written(self) -> str | dict[str, Any]:
+    def _shortest_form(self) -> str | dict[str, Any]:
         """Return the shortest form that `parse_perturbation` reads."""
         fields = {**self.settings, **({"label": self.label} if self.label else {})}
         if self.severities is not None:
@@ -145,16 +145,16 @@ class ShiftEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True, but for a class without an argument `severity`."""
-        return not is_own(self.name) or _takes_severity("shift", self.name)
+        return not is_user_defined(self.name) or _takes_severity("shift", self.name)
 
     def make(self, severity: int) -> Perturbation:
         """Return the shift at a severity."""
-        from ssad.scenarios.static.shifts.perturbation import OwnShift, Shift
+        from ssad.scenarios.static.shifts.perturbation import Shift, UserShift
 
-        if not is_own(self.name):
+        if not is_user_defined(self.name):
             _refuse_options(self.name, self.options)
             return Shift(self.name, severity, label=self.label)
-        return OwnShift(self.title, _make_object("shift", self.name, self.options, severity, ("shift",)), severity)
+        return UserShift(self.title, _make_object("shift", self.name, self.options, severity, ("shift",)), severity)
 
 
 class DigitalEntry(PerturbationEntry):
@@ -248,19 +248,19 @@ class FaultEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True, but for a class without an argument `severity`."""
-        return not is_own(self.name) or _takes_severity("fault", self.name)
+        return not is_user_defined(self.name) or _takes_severity("fault", self.name)
 
     def make(self, severity: int) -> Perturbation:
         """Return the fault at a severity."""
         from ssad.scenarios.static.faults.perturbation import Fault
 
-        if not is_own(self.name):
+        if not is_user_defined(self.name):
             _refuse_options(self.name, self.options)
             return Fault.of_camera(self.name, severity, label=self.label)
         return Fault(self.title, lambda: _make_object("fault", self.name, self.options, severity, ()), severity)
 
 
-class OwnEntry(PerturbationEntry):
+class UserEntry(PerturbationEntry):
     """Object of the user's own that derives from `Perturbation`, of any family."""
 
     family: Literal["own"]
@@ -291,7 +291,7 @@ def _parse(value: Any) -> Any:
 
 Entry = Annotated[
     Annotated[
-        ShiftEntry | DigitalEntry | TextureEntry | LightEntry | FaultEntry | OwnEntry, Field(discriminator="family")
+        ShiftEntry | DigitalEntry | TextureEntry | LightEntry | FaultEntry | UserEntry, Field(discriminator="family")
     ],
     BeforeValidator(_parse),
 ]
@@ -337,7 +337,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
                 stacklevel=2,
             )
             return _fields_of(current)
-        reference = Reference("", {}, "") if is_path(value) else Reference.of(value)
+        reference = Reference("", {}, "") if is_path(value) else Reference.parse(value)
         name = reference.name or value
         return _fields(family_of_name(name), name, dict(reference.options), reference.label)
     if not isinstance(value, Mapping) or not value:
@@ -354,7 +354,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
             other_settings.pop("name", None)
         if not isinstance(object_name, str) or not object_name:
             raise ConfigError(f"{dict(value)}: {key} is a name, a path or module:object, not {object_name!r}")
-        reference = Reference("", {}, "") if is_path(object_name) else Reference.of(object_name)
+        reference = Reference("", {}, "") if is_path(object_name) else Reference.parse(object_name)
         name, family = reference.name or object_name, SPELLINGS.get(key, key)
         if family != "own":
             _check_name(family, name)
@@ -373,7 +373,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
         settings = {"severity": settings}
     if not isinstance(settings, Mapping):
         raise ConfigError(f"{dict(value)}: below a name stand severities or settings, not {settings!r}")
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     return _fields(family_of_name(reference.name), reference.name, {**reference.options, **settings}, reference.label)
 
 
@@ -489,7 +489,7 @@ def _family_of_object(name: str) -> str:
     )
 
 
-def is_own(name: str) -> bool:
+def is_user_defined(name: str) -> bool:
     """Return True for an object of a package or of the user: not a name that SSAD registers."""
     from ssad.scenarios.static.faults.camera import FAULTS
     from ssad.scenarios.static.shifts.spec import KNOWN
@@ -534,7 +534,7 @@ def _refuse_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _setting_text(value: Any) -> str:
-    """Return a setting as `Reference.of` reads it."""
+    """Return a setting as `Reference.parse` reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

@@ -67,7 +67,7 @@ class RecordedMoment:
     time: F64
 
 
-Look = Callable[[Sequence[SensorFrame]], Sequence[U8]]
+ImageLoader = Callable[[Sequence[SensorFrame]], Sequence[U8]]
 """From camera frames of one scene, in order of time, to their images uint8 RGB [H, W, 3]."""
 
 
@@ -76,14 +76,14 @@ class PerturbedScene:
     """A recorded scene as detectors receive it.
 
     Attributes:
-        look: Returns the images of camera frames; None: the unmodified files.
+        load_images: Returns the images of camera frames; None: the unmodified files.
         notes: Returns counts for the record by name, complete after the last image; a digital attack returns its tally.
         ahead: Whether the next images may be made while a detector processes these.
         images_at_once: Camera images that should be asked for together; 0: any number.
         done: Called when the detections are stored.
     """
 
-    look: Look | None = None
+    load_images: ImageLoader | None = None
     notes: Callable[[], Mapping[str, Any]] = field(default=dict)
     ahead: bool = True
     images_at_once: int = 0

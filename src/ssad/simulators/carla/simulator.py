@@ -42,7 +42,7 @@ from ssad.simulators.carla.events import Events
 from ssad.simulators.carla.sensors import EgoSensors, SensorBlueprint
 from ssad.simulators.carla.server import Server, T, call_server, connect
 from ssad.simulators.carla.traffic import Traffic
-from ssad.simulators.mirrored import Mirrored
+from ssad.simulators.mirrored import MirroredSimulator
 from ssad.world.kernels.data import Presence
 from ssad.world.models import MODELS, WALKER_RATE
 from ssad.world.roads import town_signals, town_xodr
@@ -70,7 +70,7 @@ class _Connection:
 _CONNECTIONS: dict[Server, _Connection] = {}
 
 
-class Carla(Mirrored):
+class Carla(MirroredSimulator):
     """A `Simulator` of `ssad.core.driving` in which a CARLA server moves everybody; see the module.
 
     `mirror` is the `World` that mirrors it. `close` gives the server back as it was found.
@@ -93,12 +93,12 @@ class Carla(Mirrored):
         self.server = server
         connection = _CONNECTIONS.pop(server, None)
         self.client = connect(server) if connection is None else connection.client
-        self.world: carla.World = self._ask("get its world", self.client.get_world)
+        self.world: carla.World = self._call("get its world", self.client.get_world)
         # Another client may have loaded another world since; then our map and lights are outdated.
         if connection is None or self.world.id != connection.world.id:
             connection = _Connection(self.client, self.world)
         self.town, self._lights = connection.town, connection.lights
-        self._original_settings: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
+        self._original_settings: carla.WorldSettings = self._call("get its settings", self.world.get_settings)
         self._bodies: dict[int, carla.Actor] = {}
         self._centre_offsets: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
         self._events = Events(str(server))
@@ -106,7 +106,7 @@ class Carla(Mirrored):
         self._frame = 0
         self._traffic: Traffic | None = None
         if server.traffic == "manager":
-            self._traffic = self._ask("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
+            self._traffic = self._call("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
         self._touching: set[int] = set()
         self._light_states: dict[int, int] = {}
         self._controls: F32 = np.zeros((1, self.agents, 4), np.float32)
@@ -130,7 +130,7 @@ class Carla(Mirrored):
         """Counts of the ego's own sensors in this episode, as `Events.measured`."""
         return self._events.measured
 
-    def _ask(self, action: str, request: Callable[[], T]) -> T:
+    def _call(self, action: str, request: Callable[[], T]) -> T:
         return call_server(self.server, action, request)
 
     # ------------------------------------------------------------ the start
@@ -146,22 +146,22 @@ class Carla(Mirrored):
         episode = self._episode
         if episode.town != self.town:
             self._load_town(episode.town)
-        self._ask("change its settings", self._synchronise)
-        self._ask("set the weather", self._set_weather)
+        self._call("change its settings", self._synchronise)
+        self._call("set the weather", self._set_weather)
         active = self.mirror.array("active")[0]
         for agent_index, agent in enumerate(episode.agents):
             if active[agent_index] != Presence.ABSENT:
                 self._spawn(agent_index, agent.pose)
-        self._ask("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
-        self._ask(
+        self._call("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
+        self._call(
             "attach its sensors", lambda: self._ego_sensors.attach(self.world, self._bodies[0], self._centre_offsets[0])
         )
         if self._traffic is not None:
-            self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
+            self._call("begin with its Traffic Manager", partial(self._traffic.begin, episode))
         self._tick()  # all bodies drop onto the road
         for agent_index, agent in enumerate(episode.agents):
             if agent.speed != 0.0 and agent_index in self._bodies and agent.controller not in _FREE:
-                self._ask(
+                self._call(
                     f"set the speed of {agent.name}", partial(self._set_speed, agent_index, agent.pose, agent.speed)
                 )
         self._events.begin(self._frame)
@@ -171,9 +171,9 @@ class Carla(Mirrored):
 
         map_text = town_xodr(town)
         self.client.set_timeout(5.0 * self.server.timeout)
-        server_maps = [name.rsplit("/", 1)[-1] for name in self._ask("list its maps", self.client.get_available_maps)]
+        server_maps = [name.rsplit("/", 1)[-1] for name in self._call("list its maps", self.client.get_available_maps)]
         if town in server_maps:
-            self.world = self._ask(f"load the map {town}", lambda: self.client.load_world(town))
+            self.world = self._call(f"load the map {town}", lambda: self.client.load_world(town))
         else:
             generation = carla.OpendriveGenerationParameters(
                 vertex_distance=2.0,
@@ -183,11 +183,11 @@ class Carla(Mirrored):
                 smooth_junctions=True,
                 enable_mesh_visibility=True,
             )
-            self.world = self._ask(
+            self.world = self._call(
                 f"make a world of the map of {town}", lambda: self.client.generate_opendrive_world(map_text, generation)
             )
         self.client.set_timeout(self.server.timeout)
-        server_map_text = self._ask("get its map", lambda: self.world.get_map().to_opendrive())
+        server_map_text = self._call("get its map", lambda: self.world.get_map().to_opendrive())
         if not _same_roads(map_text, server_map_text, str(self.server)):
             raise ConfigError(
                 f"{self.server}: its map {town} has other roads than the town here; import the server's map under "
@@ -195,7 +195,7 @@ class Carla(Mirrored):
             )
         self._lights = {}
         for signal, name in town_signals(town).items():
-            light = self._ask("find a traffic light", partial(self.world.get_traffic_light_from_opendrive_id, name))
+            light = self._call("find a traffic light", partial(self.world.get_traffic_light_from_opendrive_id, name))
             if light is not None:
                 self._lights[signal] = light
         self.town = town
@@ -228,7 +228,7 @@ class Carla(Mirrored):
             return self.world.try_spawn_actor(blueprint, self._transform(pose))
 
         try:
-            body = self._ask(f"spawn {agent.name}", spawn)
+            body = self._call(f"spawn {agent.name}", spawn)
         except IndexError:  # the library raises this for an unknown blueprint
             raise ConfigError(f"{self.server}: it has no blueprint {BLUEPRINTS.get(agent.model)}") from None
         if body is None:
@@ -241,9 +241,9 @@ class Carla(Mirrored):
             0.0 if kind in (AgentKind.PROP, AgentKind.WALKER) else float(body.bounding_box.location.x)
         )
         if abs(self._centre_offsets[agent_index]) > 0.01:
-            self._ask(f"place {agent.name}", lambda: body.set_transform(self._transform(pose, agent_index)))
+            self._call(f"place {agent.name}", lambda: body.set_transform(self._transform(pose, agent_index)))
         if agent.controller in _FREE and agent_index > 0:
-            self._ask(f"hold {agent.name}", lambda: body.set_simulate_physics(False))
+            self._call(f"hold {agent.name}", lambda: body.set_simulate_physics(False))
 
     def _transform(self, pose: Pose, agent_index: int = -1) -> carla.Transform:
         import carla
@@ -273,7 +273,7 @@ class Carla(Mirrored):
         control = np.where((controllers == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
         active = world.array("active").copy()
         time = (int(world.array("step")[0]) + 1) * self.dt
-        self._ask("show its traffic lights", self._set_signals)
+        self._call("show its traffic lights", self._set_signals)
         self._apply_controls(controllers[0], control[0], active[0], time)
         self._tick()
         placements = self._measure_placements(time)
@@ -315,7 +315,7 @@ class Carla(Mirrored):
                 if pose is None:
                     self._destroy(agent_index)
                 elif agent_index in self._bodies:
-                    self._ask(
+                    self._call(
                         f"place {agent.name}",
                         partial(self._bodies[agent_index].set_transform, self._transform(pose, agent_index)),
                     )
@@ -335,9 +335,9 @@ class Carla(Mirrored):
                     and controllers[agent_index] == Controller.AUTOPILOT
                     and not is_walker
                 ):
-                    if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven:
+                    if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven_bodies:
                         command = partial(self._traffic.take, agent_index, self._bodies[agent_index], self._episode)
-                        self._ask(f"hand {agent.name} to its Traffic Manager", command)
+                        self._call(f"hand {agent.name} to its Traffic Manager", command)
                     continue
                 apply = self._control_walker if is_walker else self._control_vehicle
                 yaw, command, controller = (
@@ -345,7 +345,7 @@ class Carla(Mirrored):
                     control[agent_index],
                     Controller(int(controllers[agent_index])),
                 )
-                self._ask(f"control {agent.name}", partial(apply, agent_index, command, yaw, controller))
+                self._call(f"control {agent.name}", partial(apply, agent_index, command, yaw, controller))
 
     def _control_vehicle(self, agent_index: int, control: F32, yaw: float, controller: Controller) -> None:
         import carla
@@ -372,7 +372,7 @@ class Carla(Mirrored):
         walker.apply_control(carla.WalkerControl(direction=direction, speed=speed, jump=False))
 
     def _tick(self) -> None:
-        self._frame = self._ask("advance", lambda: self.world.tick(self.server.timeout))
+        self._frame = self._call("advance", lambda: self.world.tick(self.server.timeout))
 
     def sensor_reading(self, name: str, scene_agent: Sequence[int]) -> F32 | U8:
         """Return the present reading of one of CARLA's own sensors on an agent (scene, number): the ego alone."""
@@ -386,7 +386,7 @@ class Carla(Mirrored):
         """Return [1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; absent agents keep their place."""
         world = self.mirror
         placements = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
-        snapshot = self._ask("tell where everybody is", self.world.get_snapshot)
+        snapshot = self._call("tell where everybody is", self.world.get_snapshot)
         for agent_index, body in self._bodies.items():
             actor_state = snapshot.find(body.id)
             if actor_state is None:
@@ -405,22 +405,24 @@ class Carla(Mirrored):
             raise ConfigError(f"{self.server}: it tells places that are no numbers")
         return placements.astype(np.float32)
 
-    def _remove_departed(self, controllers: I32, before: I32) -> None:
+    def _remove_departed(self, controllers: I32, previous_controllers: I32) -> None:
         """Remove background traffic at the end of its route, and from CARLA all agents that left the mirror."""
         world = self.mirror
-        removed = np.zeros((1, self.agents), bool)
+        is_removed = np.zeros((1, self.agents), bool)
         route = world.state().route[0]
         at_end = world.array("progress")[0] >= route[:, 1] - 3
-        removed[0] = at_end & (controllers == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
-        if removed.any():
-            world.remove(removed)
+        is_removed[0] = (
+            at_end & (controllers == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
+        )
+        if is_removed.any():
+            world.remove(is_removed)
         for agent_index in list(self._bodies):
             if world.array("active")[0, agent_index] == Presence.ABSENT:
                 self._destroy(agent_index)
 
     def _add_sensor_contacts(self) -> None:
         """Add contacts that only the collision sensor reported: other body shapes, objects of the town."""
-        self._ask("look after its sensors", self._events.check)
+        self._call("look after its sensors", self._events.check)
         collisions, self._events.collisions = self._events.collisions, []
         agent_by_body = {body.id: agent_index for agent_index, body in self._bodies.items()}
         touching = {
@@ -453,13 +455,13 @@ class Carla(Mirrored):
     def _destroy(self, agent_index: int) -> None:
         body = self._bodies.pop(agent_index, None)
         if body is not None:
-            self._ask("take somebody out", body.destroy)
+            self._call("take somebody out", body.destroy)
 
     def _clear(self) -> None:
         """Remove all spawned bodies and sensors."""
         self._touching = set()
-        self._ask("take its collision and lane sensors out", self._events.detach)
-        self._ask("take its sensors out", self._ego_sensors.detach)
+        self._call("take its collision and lane sensors out", self._events.detach)
+        self._call("take its sensors out", self._ego_sensors.detach)
         for agent_index in list(self._bodies):
             self._destroy(agent_index)
 
@@ -468,8 +470,8 @@ class Carla(Mirrored):
         with suppress(ConfigError):
             self._clear()
             if self._traffic is not None:
-                self._ask("leave its Traffic Manager", self._traffic.end)
-            self._ask("change its settings", lambda: self.world.apply_settings(self._original_settings))
+                self._call("leave its Traffic Manager", self._traffic.end)
+            self._call("change its settings", lambda: self.world.apply_settings(self._original_settings))
             _CONNECTIONS[self.server] = _Connection(self.client, self.world, self.town, self._lights)
 
 

@@ -31,11 +31,11 @@ class Traffic:
         self._port = port + OFFSET if port + OFFSET < 65536 else port - OFFSET
         self._manager = client.get_trafficmanager(self._port)
         self._manager.set_synchronous_mode(True)
-        self.driven: set[int] = set()
+        self.driven_bodies: set[int] = set()
 
     def begin(self, episode: Episode) -> None:
         """Start an episode without any driven vehicle; the manager's random stream depends on the episode alone."""
-        self.driven = set()
+        self.driven_bodies = set()
         self._manager.set_random_device_seed(int(digest("traffic manager", episode.key)[:7], 16))
 
     def take(self, number: int, body: carla.Actor, episode: Episode) -> None:
@@ -51,7 +51,7 @@ class Traffic:
             points = agent.route.xy[EVERY::EVERY].tolist()
             # CARLA's frame is left-handed: y changes its sign.
             self._manager.set_path(vehicle, [carla.Location(x, -y, 0.0) for x, y in points])
-        self.driven.add(number)
+        self.driven_bodies.add(number)
 
     def end(self) -> None:
         """Restore the manager's asynchronous mode."""

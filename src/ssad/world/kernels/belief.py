@@ -1,4 +1,4 @@
-"""Observable state of all agents at the start of a step: the rows of `Seen` that hold the truth.
+"""Observable state of all agents at the start of a step: the rows of `PerceivedAgents` that hold the truth.
 
 No agent knows the intention of another, the ego's included. An agent that follows its route shows by its turn signal
 how it leaves the next junction, and from there its lane leads to the junction after; beyond, it is expected to go
@@ -15,13 +15,13 @@ from ssad.world.kernels.data import (
     STRIDE,
     End,
     EpisodeArrays,
+    PerceivedAgents,
     Presence,
     Roads,
-    Seen,
     State,
     TurnRank,
 )
-from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
+from ssad.world.kernels.lanes import ASIDE, is_changing_lane, on_oncoming_lane, turn_signal, way_at
 from ssad.world.kernels.shared import row, signal_state, wrap
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
@@ -35,7 +35,15 @@ LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expec
 
 @wp.func
 def light(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, e: int, index: int, dt: float
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    e: int,
+    index: int,
+    dt: float,
 ) -> int:
     """Return the state of a signal as agent i perceives it."""
     if i == 0 and perceived.believes[b] == 1 and perceived.light[b, index] != AS_IT_IS:
@@ -48,7 +56,7 @@ def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp
     """Return whether an agent is on its route and heads along it."""
     point = row(roads.path, route[0] + at)
     expected_pose = wp.vec3(point[0], point[1], point[2])
-    if changes(shift):
+    if is_changing_lane(shift):
         expected_pose = way_at(roads, route[0], route[1], shift, float(at))
     dx = pose[0] - expected_pose[0]
     dy = pose[1] - expected_pose[1]
@@ -70,7 +78,7 @@ def announced_distance(roads: Roads, route: wp.vec2i, at: int) -> float:
 
 
 @wp.func
-def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
+def pose_along_arc(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
     """Return the pose after `distance` metres at a constant curvature, which ends after a quarter of a turn."""
     angle = wp.clamp(curvature * distance, -LARGEST_TURN, LARGEST_TURN)
     arc = distance
@@ -119,7 +127,7 @@ def ahead_at(
     """Return the predicted pose of an agent after `ahead` metres."""
     predicted = pose
     if not follows:
-        predicted = turned(pose, ahead, curvature)
+        predicted = pose_along_arc(pose, ahead, curvature)
     else:
         predicted = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, shown_distance))
         excess = float(at) + ahead - shown_distance
@@ -131,13 +139,15 @@ def ahead_at(
 
 
 @wp.func
-def around(box: wp.vec4, q: wp.vec3) -> wp.vec4:
+def extend_box(box: wp.vec4, q: wp.vec3) -> wp.vec4:
     """Extend a box to contain a point."""
     return wp.vec4(wp.min(box[0], q[0]), wp.min(box[1], q[1]), wp.max(box[2], q[0]), wp.max(box[3], q[1]))
 
 
 @wp.func
-def look_at(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, dt: float):
+def fill_agent_row(
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: PerceivedAgents, b: int, i: int, dt: float
+):
     """Fill the row of an agent."""
     if state.active[b, i] == Presence.ABSENT:
         perceived.kind[b, i] = AgentKind.NONE
@@ -176,8 +186,8 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b:
         rule = row(roads.rule, route_point)
         way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[route_point] + 0.5)
         signal = roads.path_signal[route_point]
-        if changes(shift) and state.controller[b, i] == Controller.AUTOPILOT:
-            change[0] = indicates(shift, state.aim[b, i][0])
+        if is_changing_lane(shift) and state.controller[b, i] == Controller.AUTOPILOT:
+            change[0] = turn_signal(shift, state.aim[b, i][0])
             if on_oncoming_lane(roads, route_point, shift):
                 change[1] = 1
             way[3] = way[3] + ASIDE
@@ -202,7 +212,7 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b:
             third = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 3))
             fourth = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 4))
             put_four(perceived.forecast, flat_index + k, first, second, third, fourth)
-            box = around(around(around(around(box, first), second), third), fourth)
+            box = extend_box(extend_box(extend_box(extend_box(box, first), second), third), fourth)
     else:
         for k in range(0, HORIZON, 4):
             put_four(perceived.forecast, flat_index + k, pose, pose, pose, pose)
@@ -213,9 +223,11 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b:
 
 
 @wp.kernel(enable_backward=False)
-def see(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, agents: int, threads: int, dt: float):
+def fill_all_rows(
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: PerceivedAgents, agents: int, threads: int, dt: float
+):
     """Fill the row of every agent."""
     b, first_agent = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first_agent, agents, threads):
-            look_at(bank, roads, state, perceived, b, i, dt)
+            fill_agent_row(bank, roads, state, perceived, b, i, dt)

@@ -24,7 +24,7 @@ REGISTERS_OF_MOTION = 48
 BLOCK = 128
 
 
-class When(IntEnum):
+class PhaseCondition(IntEnum):
     """Start condition of a phase: the kinds of `ssad.core.types.PhaseTrigger`."""
 
     ALWAYS = 0
@@ -143,7 +143,7 @@ class State:
 
 
 @wp.struct
-class Seen:
+class PerceivedAgents:
     """Observable state of agents, the same for every observer: all that an Autopilot knows of others.
 
     The rows from 0 to A - 1 hold the truth about each agent; those from A on hold what the scene's ego believes to be
@@ -197,7 +197,7 @@ class Work:
 
     count: wp.array(dtype=wp.int32)  # [1]
     pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)
-    # [B, A] whom an Autopilot follows: gap in cm * LEADERS + row of `Seen`, or NO_LEADER
+    # [B, A] whom an Autopilot follows: gap in cm * LEADERS + row of `PerceivedAgents`, or NO_LEADER
     leader: wp.array2d(dtype=wp.int32)
 
 

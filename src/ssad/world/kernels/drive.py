@@ -6,8 +6,18 @@ The Autopilot is the background traffic and the ego baseline alike; its reaction
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import FAR, REGISTERS, End, EpisodeArrays, Presence, Roads, Seen, State, When
-from ssad.world.kernels.lanes import changes, metres_left, way_slope
+from ssad.world.kernels.data import (
+    FAR,
+    REGISTERS,
+    End,
+    EpisodeArrays,
+    PerceivedAgents,
+    PhaseCondition,
+    Presence,
+    Roads,
+    State,
+)
+from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
 
@@ -22,20 +32,20 @@ def idm_free(v: float, target: float) -> float:
 
 @wp.func
 def condition_holds(state: State, b: int, i: int, condition: wp.vec3, dt: float) -> bool:
-    """Return whether a phase may begin; when: `When`, value, agent."""
+    """Return whether a phase may begin; when: `PhaseCondition`, value, agent."""
     kind = int(condition[0])
-    holds = kind == When.ALWAYS
-    if kind == When.EGO_DISTANCE:
+    holds = kind == PhaseCondition.ALWAYS
+    if kind == PhaseCondition.EGO_DISTANCE:
         ego_pose = state.pose[b, 0]
         other_pose = state.pose[b, int(condition[2])]
         holds = wp.length(wp.vec2(ego_pose[0] - other_pose[0], ego_pose[1] - other_pose[1])) < condition[1]
-    elif kind == When.EGO_SPEED:
+    elif kind == PhaseCondition.EGO_SPEED:
         holds = state.speed[b, 0] > condition[1]
-    elif kind == When.TRAVELLED:
+    elif kind == PhaseCondition.TRAVELLED:
         holds = state.travelled[b, i] > condition[1]
-    elif kind == When.TIME:
+    elif kind == PhaseCondition.TIME:
         holds = float(state.step[b]) * dt >= condition[1] - 1.0e-4
-    elif kind == When.AFTER:
+    elif kind == PhaseCondition.AFTER:
         holds = float(state.step[b] - state.since[b, i]) * dt >= condition[1] - 1.0e-4
     return holds
 
@@ -59,7 +69,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     reference_curvature = roads.path[route[0] + reference][3]
     shift = state.shift[b, i]
     along = float(at) + offset
-    if changes(shift):
+    if is_changing_lane(shift):
         lateral = lateral - metres_left(roads, route[0], route[1], shift, along)
         preview = along + 0.15 * forward_speed
         slope_ahead = way_slope(roads, route[0], route[1], shift, preview + 0.5)
@@ -70,7 +80,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     # on the path the body lags by the slip of its curvature; taking the present slip would feed back on itself
     slip = wp.asin(wp.clamp(0.5 * reference_curvature * body[2], -0.95, 0.95))
     yaw = point[2] + point[3] * (offset + 0.1 * forward_speed)
-    if changes(shift):
+    if is_changing_lane(shift):
         yaw = yaw + wp.atan(way_slope(roads, route[0], route[1], shift, along + 0.1 * forward_speed))
     heading_error = wp.clamp(wrap(pose[2] + slip - yaw), -1.2, 1.2)
     softening = 1.0 / (1.0 + 0.05 * v * v / 10.0)
@@ -82,7 +92,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
 
 
 @wp.func
-def room_behind(perceived: Seen, b: int, i: int, from_row: int, to_row: int) -> bool:
+def room_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_row: int) -> bool:
     """Return whether no agent in these rows of `perceived` is within a metre and a half behind a vehicle."""
     pose = perceived.pose[b, i]
     own_half = perceived.half[b, i]
@@ -110,7 +120,15 @@ def room_behind(perceived: Seen, b: int, i: int, from_row: int, to_row: int) -> 
 
 @wp.func
 def drive_one(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, agents: int, rows: int, dt: float
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    agents: int,
+    rows: int,
+    dt: float,
 ):
     """Compute the controls of an agent that is not external."""
     if state.active[b, i] == Presence.ABSENT:
@@ -132,7 +150,7 @@ def drive_one(
             if condition_holds(state, b, i, bank.phase_when[e, i, phase], dt):
                 phase = phase + 1
                 state.since[b, i] = 0
-                if phase < count and int(bank.phase_when[e, i, phase][0]) == When.AFTER:
+                if phase < count and int(bank.phase_when[e, i, phase][0]) == PhaseCondition.AFTER:
                     state.since[b, i] = state.step[b]
             else:
                 advancing = 0
@@ -201,7 +219,14 @@ def drive_one(
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
 def drive(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, agents: int, rows: int, threads: int, dt: float
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    agents: int,
+    rows: int,
+    threads: int,
+    dt: float,
 ):
     """Compute the controls of every agent that is not external, from the state of all at the start of the step."""
     b, first = wp.tid()

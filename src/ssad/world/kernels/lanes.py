@@ -6,7 +6,7 @@ another (`State.shift`); the route's points hold the width of these lanes (`Road
 
 import warp as wp
 
-from ssad.world.kernels.data import Roads, Seen
+from ssad.world.kernels.data import PerceivedAgents, Roads
 from ssad.world.kernels.shared import route_at, route_frame
 
 CHANGE_ACCEL = wp.constant(2.5)  # m/s^2 to the side in a lane change
@@ -15,13 +15,13 @@ PEAK = wp.constant(5.77)  # greatest second derivative of the quintic
 
 
 @wp.func
-def changes(shift: wp.vec4) -> bool:
+def is_changing_lane(shift: wp.vec4) -> bool:
     """Return whether an agent is, or was, off its route: see `State.shift`."""
     return shift[2] != 0.0 or shift[3] != 0.0
 
 
 @wp.func
-def indicates(shift: wp.vec4, u: float) -> int:
+def turn_signal(shift: wp.vec4, u: float) -> int:
     """Return the turn signal of an agent `u` metres along its route: 1 left, -1 right, 0 none."""
     signal = int(0)
     if u < shift[1]:
@@ -66,7 +66,7 @@ def way_slope(roads: Roads, first: int, count: int, shift: wp.vec4, u: float) ->
 def way_frame(roads: Roads, first: int, count: int, shift: wp.vec4, u: float) -> wp.vec4:
     """Return `route_frame` of the intended path: the route and the lane change beside it."""
     frame = route_frame(roads, first, count, u)
-    if changes(shift):
+    if is_changing_lane(shift):
         left = metres_left(roads, first, count, shift, u)
         slope = way_slope(roads, first, count, shift, u)
         norm = 1.0 / wp.sqrt(1.0 + slope * slope)
@@ -83,7 +83,7 @@ def way_frame(roads: Roads, first: int, count: int, shift: wp.vec4, u: float) ->
 def way_at(roads: Roads, first: int, count: int, shift: wp.vec4, u: float) -> wp.vec3:
     """Return `route_at` of the intended path."""
     pose = route_at(roads, first, count, u)
-    if changes(shift):
+    if is_changing_lane(shift):
         left = metres_left(roads, first, count, shift, u)
         slope = way_slope(roads, first, count, shift, u)
         pose = wp.vec3(pose[0] - left * wp.sin(pose[2]), pose[1] + left * wp.cos(pose[2]), pose[2] + wp.atan(slope))
@@ -108,7 +108,7 @@ def on_oncoming_lane(roads: Roads, first: int, shift: wp.vec4) -> bool:
 
 
 @wp.func
-def change_priority(perceived: Seen, b: int, i: int, j: int, otherwise: bool) -> bool:
+def change_priority(perceived: PerceivedAgents, b: int, i: int, j: int, otherwise: bool) -> bool:
     """Return whether i goes before j where one of them changes lanes; else `otherwise`.
 
     Of each two exactly one goes first.

@@ -17,7 +17,7 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 @wp.func
-def beside(pose: wp.vec3, half_length: float, half_width: float, x: float, y: float) -> float:
+def distance_to_body(pose: wp.vec3, half_length: float, half_width: float, x: float, y: float) -> float:
     """Return the distance from a point to a body's outline, m; 0 inside."""
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
@@ -29,7 +29,7 @@ def beside(pose: wp.vec3, half_length: float, half_width: float, x: float, y: fl
 
 
 @wp.func
-def expected(pose: wp.vec3, speed: float, rate: float, time: float) -> wp.vec3:
+def predicted_pose(pose: wp.vec3, speed: float, rate: float, time: float) -> wp.vec3:
     """Return the pose after `time` s at constant speed and rate of turn."""
     mean = pose[2] + 0.5 * rate * time
     x = pose[0] + speed * time * wp.cos(mean)
@@ -38,7 +38,7 @@ def expected(pose: wp.vec3, speed: float, rate: float, time: float) -> wp.vec3:
 
 
 @wp.func
-def rank(pose: wp.vec3, q: wp.vec3) -> float:
+def rank_distance(pose: wp.vec3, q: wp.vec3) -> float:
     """Return the distance to an agent, m; agents behind matter less, and count as twice as far."""
     dx = q[0] - pose[0]
     dy = q[1] - pose[1]
@@ -117,7 +117,7 @@ def look_at_traffic(
                     rate = 0.0
                 reach = wp.sqrt(body[0] * body[0] + body[1] * body[1]) + BESIDE
                 for horizon in range(5):
-                    predicted = expected(other_pose, speed, rate, float(horizon))
+                    predicted = predicted_pose(other_pose, speed, rate, float(horizon))
                     for index in range(STATIONS):
                         station = 2.0 * float(index)
                         if station < gap[horizon] and station <= remaining:
@@ -126,7 +126,7 @@ def look_at_traffic(
                             dy = predicted[1] - road_point[1]
                             if (
                                 dx * dx + dy * dy < reach * reach
-                                and beside(predicted, body[0], body[1], road_point[0], road_point[1]) < BESIDE
+                                and distance_to_body(predicted, body[0], body[1], road_point[0], road_point[1]) < BESIDE
                             ):
                                 gap[horizon] = station
                                 flow[horizon] = speed * wp.cos(predicted[2] - road_point[2])
@@ -139,7 +139,7 @@ def look_at_traffic(
         nearest = int(-1)
         for j in range(agents):
             if j != i and state.active[b, j] != Presence.ABSENT:
-                distance = rank(pose, state.pose[b, j])
+                distance = rank_distance(pose, state.pose[b, j])
                 if distance > last_rank and distance < best_rank:
                     best_rank = distance
                     nearest = j

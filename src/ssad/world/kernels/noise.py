@@ -38,7 +38,7 @@ class NoiseState:
 
 
 @wp.func
-def scrambled(word: wp.uint64) -> wp.uint64:
+def mix_bits(word: wp.uint64) -> wp.uint64:
     """Return 64 bits, each of which depends on all bits of `word` (the finaliser of SplitMix64)."""
     mixed = word
     mixed = (mixed ^ (mixed >> wp.uint64(30))) * wp.uint64(0xBF58476D1CE4E5B9)
@@ -50,7 +50,7 @@ def scrambled(word: wp.uint64) -> wp.uint64:
 def normals(key: wp.uint64, step: int, agent: int) -> wp.vec2:
     """Return two independent standard normal numbers (Box and Muller)."""
     counter = wp.uint64(step * 64 + agent + 1) * wp.uint64(0x9E3779B97F4A7C15)
-    word = scrambled(scrambled(key + counter) ^ counter)
+    word = mix_bits(mix_bits(key + counter) ^ counter)
     scale = wp.float32(2.3283064365386963e-10)  # 2^-32
     # The half keeps the argument of the logarithm above 0.
     first_uniform = (wp.float32(wp.uint32(word >> wp.uint64(32))) + 0.5) * scale
@@ -62,7 +62,7 @@ def normals(key: wp.uint64, step: int, agent: int) -> wp.vec2:
 
 
 @wp.func
-def act_on_chance(bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRule, noise: NoiseState, b: int, i: int):
+def apply_noise(bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRule, noise: NoiseState, b: int, i: int):
     """Turn the processes of an agent into behaviour."""
     controller = state.controller[b, i]
     control = state.control[b, i]
@@ -103,7 +103,7 @@ def act_on_chance(bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRu
 
 
 @wp.kernel(enable_backward=False)
-def chance(
+def advance_noise(
     bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRule, noise: NoiseState, agents: int, threads: int
 ):
     """Advance the processes of every agent and apply them; runs last before a step's motion."""
@@ -125,16 +125,18 @@ def chance(
             )
         noise.total[b, i, stretch] = noise.total[b, i, stretch] + normal
         noise.drift[b, i] = drift
-        act_on_chance(bank, roads, state, rule, noise, b, i)
+        apply_noise(bank, roads, state, rule, noise, b, i)
 
 
 @wp.kernel(enable_backward=False)
-def calm(state: State, noise: NoiseState, mask: wp.array(dtype=wp.int32), ended_too: int, agents: int, stretches: int):
+def reset_noise(
+    state: State, noise: NoiseState, mask: wp.array(dtype=wp.int32), ended_too: int, agents: int, stretches: int
+):
     """Reset the processes of scenes; scenes that restart by themselves get a new key. Like `restart`."""
     b = wp.tid()
     again = ended_too == 1 and state.end[b] != End.RUNNING
     if again:
-        noise.key[b] = scrambled(noise.key[b] + wp.uint64(0xD1B54A32D192ED03))
+        noise.key[b] = mix_bits(noise.key[b] + wp.uint64(0xD1B54A32D192ED03))
     if again or mask[b] == 1:
         for i in range(agents):
             noise.drift[b, i] = wp.vec2(0.0, 0.0)

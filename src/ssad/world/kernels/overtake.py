@@ -16,9 +16,9 @@ from ssad.world.kernels.data import (
     REGISTERS,
     End,
     EpisodeArrays,
+    PerceivedAgents,
     Presence,
     Roads,
-    Seen,
     State,
     Work,
 )
@@ -66,11 +66,11 @@ def place_beside(roads: Roads, route: wp.vec2i, u0: float, guess: float, q: wp.v
 
 
 @wp.func
-def gaps(
+def examine_lane(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     b: int,
     i: int,
     e: int,
@@ -155,7 +155,7 @@ def end_of_block(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     b: int,
     i: int,
     e: int,
@@ -220,7 +220,7 @@ def way_is_clear(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     b: int,
     i: int,
     j: int,
@@ -245,8 +245,8 @@ def way_is_clear(
 
 
 @wp.func
-def break_off(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, e: int, rows: wp.vec2i
+def should_abort_passing(
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: PerceivedAgents, b: int, i: int, e: int, rows: wp.vec2i
 ) -> bool:
     """Abort passing on the oncoming lane if traffic comes and there is room to stop behind the obstacle."""
     route = bank.route[e, i]
@@ -256,7 +256,7 @@ def break_off(
     speed = wp.max(state.speed[b, i], 0.0)
     top = state.aim[b, i][1]
     shortest = 2.0 * RAMP_LEAST * own_body[0]
-    own_lane = gaps(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+    own_lane = examine_lane(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
     stopping_room = own_lane[0] - wp.max(0.5 * speed * speed / -FIRM, shortest * lanes_left(shift, u0))
     if own_lane[3] != 0.0 or own_lane[0] >= FAR or own_lane[1] > 0.5 or stopping_room < 1.0:
         return False
@@ -267,7 +267,7 @@ def break_off(
     goal = beyond + own_body[0] + wp.max(shortest, RAMP_TIME * top)
     duration = passing_time(speed, top, goal)
     # Less cautious than before the manoeuvre begins, or it would abort what has just been allowed.
-    oncoming_lane = gaps(
+    oncoming_lane = examine_lane(
         bank, roads, state, perceived, b, i, e, rows, 1.0, speed, wp.max(duration - 1.0, 0.0), goal - 5.0
     )
     if oncoming_lane[4] == 0.0:
@@ -284,7 +284,7 @@ def choose_lane(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     work: Work,
     b: int,
     i: int,
@@ -308,7 +308,7 @@ def choose_lane(
     if i == 0 and perceived.believes[b] == 1:
         rows = wp.vec2i(agents, all_rows)
     if shift[3] > 0.0 and on_oncoming_lane(roads, route[0] + state.progress[b, i], shift):
-        if break_off(bank, roads, state, perceived, b, i, e, rows):
+        if should_abort_passing(bank, roads, state, perceived, b, i, e, rows):
             return
     if u0 < shift[1]:
         return  # changes lane already
@@ -327,7 +327,7 @@ def choose_lane(
         if shift[3] < 0.0:
             leads_on = adjacent_lanes[3] - offset
         oncoming = shift[3] > 0.0 and adjacent_lanes[1] < 0.0
-        lane_gaps = gaps(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+        lane_gaps = examine_lane(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
         must_return = oncoming or leads_on < change_length + 4.0 * speed + 30.0
         free = lane_gaps[0] > 15.0 + 3.0 * speed or lane_gaps[1] > top - 1.0
         safe = (
@@ -395,7 +395,7 @@ def choose_lane(
             exists = adjacent_lanes[0] > 0.0 and adjacent_lanes[1] < 0.0 and stands
         if not decided and exists and leads_on > goal + 10.0:
             wants = bool(True)
-            lane_gaps = gaps(bank, roads, state, perceived, b, i, e, rows, share, speed, time, goal)
+            lane_gaps = examine_lane(bank, roads, state, perceived, b, i, e, rows, share, speed, time, goal)
             safe = lane_gaps[3] == 0.0 and lane_gaps[2] > FIRM
             if option == 2:
                 safe = safe and lane_gaps[4] == 0.0
@@ -421,7 +421,7 @@ def change_lanes(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     work: Work,
     agents: int,
     all_rows: int,

@@ -9,9 +9,9 @@ from ssad.world.kernels.data import (
     Ego,
     End,
     EpisodeArrays,
+    PerceivedAgents,
     Presence,
     Roads,
-    Seen,
     State,
     TurnRank,
     Work,
@@ -20,7 +20,7 @@ from ssad.world.kernels.shared import BRIDGE, boxes_touch, height_of, on_track, 
 
 
 @wp.func
-def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
+def halfway_pose(a: wp.vec3, b: wp.vec3) -> wp.vec3:
     """Return the pose half-way between two."""
     return wp.vec3(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), a[2] + 0.5 * wrap(b[2] - a[2]))
 
@@ -47,10 +47,10 @@ def look_for_contacts(bank: EpisodeArrays, roads: Roads, state: State, b: int, i
                     if not hit:
                         other_previous = state.previous[b, j]
                         hit = boxes_touch(
-                            halfway(own_previous, own_pose),
+                            halfway_pose(own_previous, own_pose),
                             own_body[0],
                             own_body[1],
-                            halfway(other_previous, other_pose),
+                            halfway_pose(other_previous, other_pose),
                             other_body[0],
                             other_body[1],
                         )
@@ -235,7 +235,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
 
 
 @wp.func
-def put_back(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
+def reset_agent(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
     """Reset an agent to the start of its episode."""
     e = state.episode[b]
     start = bank.start[e, i]
@@ -290,7 +290,7 @@ def restart(
         restarts = True
     if restarts:
         for i in range(first, agents, threads):
-            put_back(bank, roads, state, b, i)
+            reset_agent(bank, roads, state, b, i)
 
 
 @wp.kernel(enable_backward=False)
@@ -298,7 +298,7 @@ def restart_record(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     ego: Ego,
     mask: wp.array(dtype=wp.int32),
     ended_too: int,

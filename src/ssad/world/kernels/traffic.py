@@ -18,15 +18,15 @@ from ssad.world.kernels.data import (
     STRIDE,
     End,
     EpisodeArrays,
+    PerceivedAgents,
     Presence,
     Roads,
-    Seen,
     State,
     TurnRank,
     Work,
 )
 from ssad.world.kernels.drive import room_behind
-from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, changes, way_frame
+from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
 from ssad.world.kernels.shared import (
     BRIDGE,
     IDM_ACCEL,
@@ -63,7 +63,7 @@ def idm_gap(v: float, lead: float, gap: float) -> float:
 @wp.func
 def lead_gap(
     roads: Roads,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     b: int,
     j: int,
     route: wp.vec2i,
@@ -152,14 +152,23 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
 
 @wp.func
-def inside(perceived: Seen, b: int, j: int) -> bool:
+def is_in_junction(perceived: PerceivedAgents, b: int, j: int) -> bool:
     """Return whether an agent's front has entered the junction."""
     return perceived.way[b, j][1] < perceived.half[b, j][0] - 1.0
 
 
 @wp.func
-def waits(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
+def is_waiting(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    me: int,
+    i: int,
+    j: int,
+    e: int,
+    dt: float,
 ) -> bool:
     """Return whether i, still before the junction, lets j go first, which is inside.
 
@@ -179,8 +188,16 @@ def waits(
 
 
 @wp.func
-def clears(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, me: int, j: int, e: int, dt: float
+def is_clearing(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    me: int,
+    j: int,
+    e: int,
+    dt: float,
 ) -> bool:
     """Return whether j can no longer stop before the junction although its signal is not green for `me` any more."""
     index = perceived.signal[b, j]
@@ -194,7 +211,7 @@ def clears(
 
 
 @wp.func
-def first_there(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: int) -> bool:
+def arrives_first(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: int) -> bool:
     """Return whether i reaches a place sooner than j; bit-identical for either observer."""
     own_term = far_i * (wp.max(v_j, 0.0) + 1.0)
     other_term = far_j * (wp.max(v_i, 0.0) + 1.0)
@@ -203,28 +220,36 @@ def first_there(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: i
 
 @wp.func
 def has_priority(
-    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, j: int, e: int, dt: float
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    j: int,
+    e: int,
+    dt: float,
 ) -> bool:
     """Return whether i goes before j (rows of `perceived`) where their paths cross; of each two exactly one goes first.
 
     Another Autopilot is relied on to give way, and so is the ego under any driver: traffic does not know which agent
-    is under test. Scripted actors and walkers are not. Priority goes to the agent inside the junction (see `waits`),
-    then to the one that is too late to stop at a signal (see `clears`), then to the one without a stop or yield sign,
+    is under test. Scripted actors and walkers are not. Priority goes to the agent inside the junction (`is_waiting`),
+    then to the one that is too late to stop at a signal (`is_clearing`), then to the one without a stop or yield sign,
     straight before right before left, then to the one nearer to it, then to the lower number.
     """
     if perceived.gives_way[b, j] == 0:
         return False
     own_way = perceived.way[b, i]
     other_way = perceived.way[b, j]
-    inside_i = inside(perceived, b, i)
-    inside_j = inside(perceived, b, j)
-    if inside_i and not inside_j and waits(bank, roads, state, perceived, b, i, j, i, e, dt):
+    inside_i = is_in_junction(perceived, b, i)
+    inside_j = is_in_junction(perceived, b, j)
+    if inside_i and not inside_j and is_waiting(bank, roads, state, perceived, b, i, j, i, e, dt):
         return True
-    if inside_j and not inside_i and waits(bank, roads, state, perceived, b, i, i, j, e, dt):
+    if inside_j and not inside_i and is_waiting(bank, roads, state, perceived, b, i, i, j, e, dt):
         return False
     if not inside_i and not inside_j:
-        late_i = clears(bank, roads, state, perceived, b, i, i, e, dt)
-        late_j = clears(bank, roads, state, perceived, b, i, j, e, dt)
+        late_i = is_clearing(bank, roads, state, perceived, b, i, i, e, dt)
+        late_j = is_clearing(bank, roads, state, perceived, b, i, j, e, dt)
         if late_i != late_j:
             return late_i
     if own_way[2] != other_way[2]:
@@ -241,14 +266,14 @@ def has_priority(
             dy = other_pose[1] - own_pose[1]
             far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
             far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
-            return first_there(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+            return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
     return i < j
 
 
 @wp.func
 def conflict_gap(
     roads: Roads,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     b: int,
     j: int,
     route: wp.vec2i,
@@ -319,8 +344,8 @@ def conflict_gap(
 
 
 @wp.func
-def apart(
-    perceived: Seen,
+def cannot_meet(
+    perceived: PerceivedAgents,
     b: int,
     j: int,
     pose: wp.vec3,
@@ -345,11 +370,11 @@ def apart(
 
 
 @wp.func
-def look_around(
+def scan_agents(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     work: Work,
     b: int,
     i: int,
@@ -412,7 +437,7 @@ def look_around(
     view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), SIGHT)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
-    if changes(shift):
+    if is_changing_lane(shift):
         bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - point[2]))
     box_low = wp.vec2(pose[0], pose[1])
     box_high = box_low
@@ -422,7 +447,7 @@ def look_around(
         box_high = wp.vec2(wp.max(box_high[0], frame[0]), wp.max(box_high[1], frame[1]))
     # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
     padding = own_body[0] + LONGEST + 4.0
-    if changes(shift):
+    if is_changing_lane(shift):
         padding = padding + ASIDE
     box_low = wp.vec2(box_low[0] - padding, box_low[1] - padding)
     box_high = wp.vec2(box_high[0] + padding, box_high[1] + padding)
@@ -462,7 +487,7 @@ def look_around(
                     reach = half_width
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own_body[0] + other_half[0] + 2.0
-                    if not apart(
+                    if not cannot_meet(
                         perceived, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
                     ):
                         flags = flags + 2
@@ -474,11 +499,11 @@ def look_around(
 
 
 @wp.kernel(enable_backward=False)
-def sight(
+def scan_all_agents(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     work: Work,
     agents: int,
     rows: int,
@@ -493,22 +518,22 @@ def sight(
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            look_around(bank, roads, state, perceived, work, b, i, agents, rows, dt)
+            scan_agents(bank, roads, state, perceived, work, b, i, agents, rows, dt)
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
-def meet(
+def react_to_agents(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    perceived: Seen,
+    perceived: PerceivedAgents,
     work: Work,
     agents: int,
     rows: int,
     workers: int,
     dt: float,
 ):
-    """Compute the reactions of Autopilots to the agents that `sight` listed: following, stopping and giving way."""
+    """Compute how Autopilots react to the agents that `scan_all_agents` listed: following, stopping, giving way."""
     tid = wp.tid()
     total = work.count[0]
     slot = int(tid)
@@ -597,7 +622,7 @@ def meet(
                     signal_now = int(SignalState.OFF)
                     if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
                         signal_now = light(bank, roads, state, perceived, b, i, e, index, dt)
-                    entered = inside(perceived, b, j)
+                    entered = is_in_junction(perceived, b, j)
                     crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
                     if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
                         gap = wp.min(gap, wp.max(line, 0.0) + 1.0)

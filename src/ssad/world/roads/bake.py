@@ -148,10 +148,15 @@ def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
     ):
         return None
     xy = np.stack([column["x"], column["y"]], axis=1)
-    moved = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-3])
-    if moved.sum() < 2:
+    shifted_xy = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-3])
+    if shifted_xy.sum() < 2:
         return None
-    xy, z, yaw, width = xy[moved], column["z"][moved], np.unwrap(column["yaw"][moved]), column["width"][moved]
+    xy, z, yaw, width = (
+        xy[shifted_xy],
+        column["z"][shifted_xy],
+        np.unwrap(column["yaw"][shifted_xy]),
+        column["width"][shifted_xy],
+    )
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     if arc_length[-1] < SHORT:
         return None
@@ -189,7 +194,7 @@ def _lane(network: Network, key: Key) -> Lane:
 def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: Answer) -> LaneGraph:
     keys = list(shapes)
     index = {key: row for row, key in enumerate(keys)}
-    successors = [_following(network, key, shapes) for key in keys]
+    successors = [_following_lanes(network, key, shapes) for key in keys]
     links = [sorted({index[successor] for successor in targets if successor in index}) for targets in successors]
     lane_entries = [_lane(network, key) for key in keys]
     junctions = [network.roads[key[0]].junction for key in keys]
@@ -264,11 +269,11 @@ def _paint(network: Network, key: Key) -> tuple[Marking, Marking]:
     return left, section.lanes[key[2]].mark
 
 
-def _following(network: Network, key: Key, shapes: dict[Key, _Shape]) -> list[Key]:
+def _following_lanes(network: Network, key: Key, shapes: dict[Key, _Shape]) -> list[Key]:
     """Return the lanes that begin where a lane ends, passing through lanes without area (sections of no length)."""
     successors, queue, visited = [], [key], {key}
     while queue:
-        for candidate in _linked(network, queue.pop()):
+        for candidate in _linked_lanes(network, queue.pop()):
             if candidate in visited or candidate[2] not in network.roads[candidate[0]].sections[candidate[1]].lanes:
                 continue
             visited.add(candidate)
@@ -279,7 +284,7 @@ def _following(network: Network, key: Key, shapes: dict[Key, _Shape]) -> list[Ke
     return successors
 
 
-def _linked(network: Network, key: Key) -> list[Key]:
+def _linked_lanes(network: Network, key: Key) -> list[Key]:
     """Return the lanes that the map links to the end of a lane, in its driving direction."""
     road, index, lane_id = network.roads[key[0]], key[1], key[2]
     forward = lane_id < 0
@@ -292,20 +297,20 @@ def _linked(network: Network, key: Key) -> list[Key]:
     if road_link is None:
         return []
     if road_link.kind == "road":
-        return [] if target is None else [_door(network.roads[road_link.id], road_link.contact, target)]
+        return [] if target is None else [_lane_at_end(network.roads[road_link.id], road_link.contact, target)]
     return [
-        _door(network.roads[connection.connecting], connection.contact, target_lane)
-        for connection in _ways(network, road_link, road)
+        _lane_at_end(network.roads[connection.connecting], connection.contact, target_lane)
+        for connection in _connections(network, road_link, road)
         for source_lane, target_lane in connection.lanes
         if source_lane == lane_id
     ]
 
 
-def _ways(network: Network, link: Link, road: MapRoad) -> list[Connection]:
+def _connections(network: Network, link: Link, road: MapRoad) -> list[Connection]:
     return [connection for connection in network.junctions[link.id] if connection.incoming == road.id]
 
 
-def _door(road: MapRoad, contact: str, lane: int) -> Key:
+def _lane_at_end(road: MapRoad, contact: str, lane: int) -> Key:
     """Return the key of a lane at one end of a road."""
     return (road.id, len(road.sections) - 1 if contact == "end" else 0, lane)
 

@@ -102,29 +102,29 @@ def proving_ground() -> Town:
     )
 
 
-def crossover_points(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Point, ...]:
+def crossover_points(a: Point, b: Point, *, lead: float, lateral: float = 0.0) -> tuple[Point, ...]:
     """Points of a street from a to b that leaves and arrives along one axis and crosses over between.
 
     Args:
         a: Where it begins, m.
         b: Where it ends, m.
         lead: From each end to where it turns, m. The axis is that of the longer side.
-        aside: How far to the left of the straight way from a to b it is in the middle, m; 0: no point is added there.
+        lateral: How far to the left of the straight way from a to b it is in the middle, m; 0: no point is added there.
     """
     axis = (1.0, 0.0) if abs(b[0] - a[0]) > abs(b[1] - a[1]) else (0.0, 1.0)
     step = axis[0] * (b[0] - a[0]) + axis[1] * (b[1] - a[1])
-    if not aside and (abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9):
+    if not lateral and (abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9):
         return a, b
     signed_lead = lead if step > 0.0 else -lead
     first_corner = (a[0] + signed_lead * axis[0], a[1] + signed_lead * axis[1])
     second_corner = (b[0] - signed_lead * axis[0], b[1] - signed_lead * axis[1])
-    if not aside:
+    if not lateral:
         return a, first_corner, second_corner, b
     u, v = (
         (coordinate_end - coordinate_start) / math.dist(a, b)
         for coordinate_start, coordinate_end in zip(a, b, strict=True)
     )
-    return a, first_corner, (0.5 * (a[0] + b[0]) - aside * v, 0.5 * (a[1] + b[1]) + aside * u), second_corner, b
+    return a, first_corner, (0.5 * (a[0] + b[0]) - lateral * v, 0.5 * (a[1] + b[1]) + lateral * u), second_corner, b
 
 
 def oldmarket() -> Town:

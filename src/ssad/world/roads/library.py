@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ssad.core.errors import MapError, unknown_name
 from ssad.core.lane_graph import LaneGraph, load_graph
-from ssad.core.safeio import home, read_text
+from ssad.core.safeio import home_folder, read_text
 from ssad.world.roads.bake import bake
 from ssad.world.roads.random_towns import RANDOM, write_random_town
 from ssad.world.roads.signals import signal_names
@@ -21,7 +21,7 @@ BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "
 def town_names() -> dict[str, str]:
     """Return name -> "built-in", or the path of an imported town. An import cannot take a built-in name."""
     towns = dict.fromkeys(BUILT_IN, "built-in")
-    for path in sorted((home() / "towns").glob("*.npz")):
+    for path in sorted((home_folder() / "towns").glob("*.npz")):
         towns.setdefault(path.stem, str(path))
     return towns
 
@@ -39,7 +39,7 @@ def load_town(name: str) -> LaneGraph:
     """
     if name in BUILT_IN:
         return _built_in(name)
-    path = home() / "towns" / f"{name}.npz" if Path(name).name == name else Path(name)
+    path = home_folder() / "towns" / f"{name}.npz" if Path(name).name == name else Path(name)
     if path.suffix == ".npz" and path.is_file():
         return _stored(str(path), path.stat().st_mtime_ns)
     if RANDOM.fullmatch(name):
@@ -62,7 +62,7 @@ def town_xodr(name: str) -> str:
     if name in BUILT_IN:
         return generate_town(name)
     is_name = Path(name).name == name and Path(name).suffix != ".xodr"
-    path = home() / "towns" / f"{name}.xodr" if is_name else Path(name).with_suffix(".xodr")
+    path = home_folder() / "towns" / f"{name}.xodr" if is_name else Path(name).with_suffix(".xodr")
     if not path.is_file() and RANDOM.fullmatch(name):
         return write_random_town(name)
     if not path.is_file():

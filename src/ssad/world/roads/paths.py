@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ssad.core.errors import MapError
-from ssad.core.lane_graph import LaneGraph, no_signals
+from ssad.core.lane_graph import LaneGraph, empty_signal_arrays
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, LaneType
 
@@ -76,7 +76,7 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
         right_marking=np.zeros(lane_count, np.uint8),
         succ_offset=np.zeros(lane_count + 1, np.int32),
         succ=no_links,
-        **no_signals(),
+        **empty_signal_arrays(),
     )
 
 

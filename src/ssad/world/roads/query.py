@@ -28,16 +28,16 @@ class Nearest:
         lane: Nearest lane [n]; -1 where none is within reach.
         s: Arc length along it [n], m; 0 where lane is -1.
         lateral: Distance from its centre line, left positive [n], m; 0 where lane is -1.
-        inside: Whether the point is within the lane's strip [n].
+        is_inside: Whether the point is within the lane's strip [n].
     """
 
     lane: I32
     s: F32
     lateral: F32
-    inside: Bool
+    is_inside: Bool
 
     def __iter__(self) -> Iterator[npt.NDArray[Any]]:
-        return iter((self.lane, self.s, self.lateral, self.inside))
+        return iter((self.lane, self.s, self.lateral, self.is_inside))
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class LaneQuery:
         point_count = len(points)
         lane = np.full(point_count, -1, np.int32)
         arc_length, lateral = np.zeros(point_count, np.float32), np.zeros(point_count, np.float32)
-        inside = np.zeros(point_count, np.bool_)
+        is_inside = np.zeros(point_count, np.bool_)
         cell_position = np.floor((points - np.array(grid.origin, np.float32)) / np.float32(CELL))
         size = np.array([grid.nx, grid.ny], np.float32)
         in_grid = np.flatnonzero(((cell_position >= 0) & (cell_position < size)).all(axis=1))
@@ -122,13 +122,13 @@ class LaneQuery:
             within_margin = min_gap <= MARGIN
             rows, winners = rows[within_margin], winners[within_margin]
             lane[rows], arc_length[rows] = grid.seg_lane[segment_index[winners]], along[winners]
-            lateral[rows], inside[rows] = signed_distance[winners], clearance[winners] <= 0.0
+            lateral[rows], is_inside[rows] = signed_distance[winners], clearance[winners] <= 0.0
             chunk_start = chunk_stop
-        return Nearest(lane, arc_length, lateral, inside)
+        return Nearest(lane, arc_length, lateral, is_inside)
 
     def off_road(self, xy: npt.ArrayLike) -> Bool:
         """Return whether no driving and no parking lane lies under points xy [n, 2]."""
-        return ~self.nearest(xy, DRIVABLE).inside
+        return ~self.nearest(xy, DRIVABLE).is_inside
 
 
 def _measure(grid: SegmentGrid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32, F32]:
@@ -157,7 +157,7 @@ def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32
             arc
         length at the first end, m.
     """
-    lane = np.repeat(np.arange(graph.lanes, dtype=np.int32), np.diff(graph.offset))
+    lane = np.repeat(np.arange(graph.lane_count, dtype=np.int32), np.diff(graph.offset))
     is_segment = (lane[:-1] == lane[1:]) & np.isin(graph.kind[lane[:-1]], np.asarray(types, np.uint8))
     index = np.flatnonzero(is_segment)
     endpoints = np.concatenate([graph.xy[index], graph.xy[index + 1]], axis=1)

@@ -111,23 +111,23 @@ def _is_connected(places: Iterable[Place], edges: set[Edge]) -> bool:
 
 
 def _polylines(
-    at: dict[Place, Point], edges: set[Edge], lead: float, aside: Callable[[], float]
+    positions: dict[Place, Point], edges: set[Edge], lead: float, lateral: Callable[[], float]
 ) -> list[tuple[Point, ...]]:
     """Streets from junction to junction: places with two streets are bends, not junctions.
 
     Args:
-        at: Where the places are, m.
+        positions: Where the places are, m.
         edges: Pairs of places with a street between them.
         lead: How far a street follows the axis from each place, m.
-        aside: How far off its way a street is in the middle of a block, m; drawn for each.
+        lateral: How far off its way a street is in the middle of a block, m; drawn for each.
     """
-    neighbours: dict[Place, list[Place]] = {place: [] for place in at}
+    neighbours: dict[Place, list[Place]] = {place: [] for place in positions}
     for start_place, end_place in sorted(edges):
         neighbours[start_place].append(end_place)
         neighbours[end_place].append(start_place)
     unused = set(edges)
     polylines = []
-    for start in sorted(at):
+    for start in sorted(positions):
         for following in neighbours[start] if len(neighbours[start]) > 2 else ():
             if (min(start, following), max(start, following)) not in unused:
                 continue
@@ -137,8 +137,10 @@ def _polylines(
                 (next_place,) = (place for place in neighbours[chain[-1]] if place != chain[-2])
                 unused.discard((min(chain[-1], next_place), max(chain[-1], next_place)))
                 chain.append(next_place)
-            points = [at[start]]
+            points = [positions[start]]
             for start_place, end_place in pairwise(chain):
-                points += crossover_points(at[start_place], at[end_place], lead=lead, aside=aside())[1:]
+                points += crossover_points(positions[start_place], positions[end_place], lead=lead, lateral=lateral())[
+                    1:
+                ]
             polylines.append(tuple(points))
     return polylines

@@ -41,12 +41,12 @@ class _Leg:
 
     Attributes:
         parts: Lane, s0 and s1 of each.
-        old: Lane beside this stretch, and the place on it, from which the path changes lanes along this stretch;
+        previous_lane: Lane beside this stretch, and the place on it, from which the path changes lanes here;
             None: the path keeps its lane.
     """
 
     parts: tuple[tuple[int, float, float], ...]
-    old: tuple[int, float] | None = None
+    previous_lane: tuple[int, float] | None = None
 
 
 def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]], *, spacing: float = 1.0) -> Route:
@@ -143,7 +143,7 @@ def _candidates(graph: LaneGraph, k: int, point: Pose | tuple[float, float], *, 
     if inner:
         used_lanes = {spot.lane for spot in spots}
         for spot in spots[:2]:
-            for neighbour in _beside(graph, spot.lane):
+            for neighbour in _adjacent_lanes(graph, spot.lane):
                 if neighbour not in used_lanes:
                     used_lanes.add(neighbour)
                     spots.append(
@@ -152,14 +152,14 @@ def _candidates(graph: LaneGraph, k: int, point: Pose | tuple[float, float], *, 
     return spots
 
 
-def _beside(graph: LaneGraph, lane: int) -> list[int]:
+def _adjacent_lanes(graph: LaneGraph, lane: int) -> list[int]:
     """Return the driving lanes for a lane change: neighbours of the same direction, outside junctions."""
     if graph.junction[lane] >= 0:
         return []
     return [
         neighbour
         for neighbour in (int(graph.left[lane]), int(graph.right[lane]))
-        if neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
+        if neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.is_same_direction(lane, neighbour)
     ]
 
 
@@ -232,7 +232,7 @@ def _search(graph: LaneGraph, starts: list[tuple[float, _Spot]], goal: _Spot) ->
         lane_end = float(graph.length[lane])
         for successor in _successors(graph, lane):
             push(lane_end - s, successor, 0.0, _Leg(((lane, s, lane_end),)))
-        for neighbour in _beside(graph, lane):
+        for neighbour in _adjacent_lanes(graph, lane):
             parts = _ahead(graph, neighbour, _level_position(graph, lane, s, neighbour), CHANGE)
             available = 0.0
             for part_index, (target, part_start, part_end) in enumerate(parts):
@@ -261,8 +261,8 @@ def _line(graph: LaneGraph, leg: _Leg, step: float = math.inf) -> tuple[F64, I32
 def _part(graph: LaneGraph, part: tuple[int, float, float], step: float) -> F64:
     """The rows of `_line` for one lane; those of a whole lane are kept, since most routes of a town have it."""
     lane, s0, s1 = part
-    whole = math.isinf(step) and s0 == 0.0 and s1 == float(graph.length[lane])
-    if whole and lane in graph.cache:
+    whole_rows = math.isinf(step) and s0 == 0.0 and s1 == float(graph.length[lane])
+    if whole_rows and lane in graph.cache:
         cached_rows: F64 = graph.cache[lane]
         return cached_rows
     inner_points = graph.s[graph.points(lane)].astype(np.float64) if math.isinf(step) else np.arange(s0, s1, step)
@@ -272,7 +272,7 @@ def _part(graph: LaneGraph, part: tuple[int, float, float], step: float) -> F64:
     rows = np.array(
         [(x, y, math.cos(yaw), math.sin(yaw), speed_limit, width) for x, y, yaw, width in places], np.float64
     )
-    if whole:
+    if whole_rows:
         rows.setflags(write=False)
         graph.cache[lane] = rows
     return rows
@@ -298,7 +298,9 @@ def _change(graph: LaneGraph, leg: _Leg, old: tuple[int, float]) -> tuple[F64, I
 
 def _draw(graph: LaneGraph, legs: list[_Leg], spacing: float) -> Route:
     """Return a Route with a point every `spacing` m along the legs; its last point is the last whole step."""
-    sampled_legs = [_line(graph, leg) if leg.old is None else _change(graph, leg, leg.old) for leg in legs]
+    sampled_legs = [
+        _line(graph, leg) if leg.previous_lane is None else _change(graph, leg, leg.previous_lane) for leg in legs
+    ]
     rows = np.concatenate([leg_values for leg_values, _ in sampled_legs])
     lanes = np.concatenate([leg_values for _, leg_values in sampled_legs])
     moved = np.concatenate([[True], np.hypot(*np.diff(rows[:, :2], axis=0).T) > 1e-3])

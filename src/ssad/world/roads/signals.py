@@ -114,7 +114,7 @@ def place_signs(data: Approaches) -> dict[str, Any]:
     sign_rows: list[tuple[float, float, float, int]] = []
     rule_rows: list[tuple[int, int, float]] = []
     for sign in sorted(signed_lanes, key=lambda sign_id: (len(sign_id), sign_id)):
-        lanes = _approach(data, sign, signed_lanes[sign])
+        lanes = _lanes_of_approach(data, sign, signed_lanes[sign])
         if not lanes:
             continue
         outer_lane = min(lanes, key=lambda lane_index: -abs(data.keys[lane_index][2]))
@@ -138,10 +138,10 @@ def place_signs(data: Approaches) -> dict[str, Any]:
     }
 
 
-def _approach(data: Approaches, sign: str, named: set[int]) -> list[int]:
+def _lanes_of_approach(data: Approaches, sign: str, sign_lanes: set[int]) -> list[int]:
     """Of the lanes that a sign is for, those of one approach to a junction."""
     approaches: dict[tuple[int, bool], list[int]] = {}
-    for lane_index in sorted(named):
+    for lane_index in sorted(sign_lanes):
         leads_in = any(
             data.junction[successor] >= 0 and data.kind[successor] == LaneType.DRIVING
             for successor in data.links[lane_index]
@@ -232,16 +232,16 @@ def _phases(data: Approaches, arms: list[_Approach]) -> list[int]:
     map_phases = [data.network.phase.get(arm.light or "") for arm in arms]
     if all(phase is not None for phase in map_phases) and len(set(map_phases)) > 1:
         phase_order = sorted({phase for phase in map_phases if phase is not None})
-        mapped = [phase_order.index(phase) for phase in map_phases if phase is not None]
+        mapped_phases = [phase_order.index(phase) for phase in map_phases if phase is not None]
         pairs = (
             (arm_index, other_index)
             for arm_index in range(len(arms))
             for other_index in range(arm_index)
-            if mapped[arm_index] == mapped[other_index]
+            if mapped_phases[arm_index] == mapped_phases[other_index]
         )
         # Phases that show green to crossing arms at once are not used.
         if not any(_cross(data, arms[arm_index], arms[other_index]) for arm_index, other_index in pairs):
-            return mapped
+            return mapped_phases
     phases: list[int] = []
     for arm_index, arm in enumerate(arms):
         shared_phase = -1

@@ -114,13 +114,13 @@ def _ends(town: Town) -> dict[tuple[int, bool], Junction]:
             junction.arms.append(Arm(number, street, heading, at_end))
             junction.ring = ring_by_place.get(position)
             if junction.ring:
-                junction.apart = junction.ring.setback
+                junction.arm_distance = junction.ring.setback
             junction_by_end[number, at_end] = junction
     for interchange in town.interchanges:
-        junctions[interchange.place].apart = PARTING
+        junctions[interchange.place].arm_distance = PARTING
     # The ramps' connecting roads belong to the junction of the interchange.
     for ramp_place, position in place_of_ramp.items():
-        junctions[ramp_place].id, junctions[ramp_place].apart = junctions[position].id, 0.0
+        junctions[ramp_place].id, junctions[ramp_place].arm_distance = junctions[position].id, 0.0
     return junction_by_end
 
 

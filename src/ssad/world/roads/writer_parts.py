@@ -159,20 +159,20 @@ class Junction:
         place: x, y of the middle, m.
         arms: Ends of the streets that meet there.
         ring: The roundabout, if one arm meets a roundabout at this junction.
-        apart: Distance from the place to the ends of the arms, m; None: as far as right turns need.
+        arm_distance: Distance from the place to the ends of the arms, m; None: as far as right turns need.
     """
 
     id: int
     place: Point
     arms: list[Arm] = field(default_factory=list)
     ring: Roundabout | None = None
-    apart: float | None = None
+    arm_distance: float | None = None
 
     @property
     def setback(self) -> float:
         """Distance from the middle to the ends of the arms, m."""
-        if self.apart is not None:
-            return self.apart
+        if self.arm_distance is not None:
+            return self.arm_distance
         return max(arm.street.lanes * arm.street.width + 0.5 * arm.street.median for arm in self.arms) + CLEARANCE
 
     @property

@@ -340,7 +340,7 @@ class _Reader:
                 self.fail(f"road {road.id}", f"it is linked to {link.kind} {link.id}, which the map lacks")
 
     def connections(self, junction: Element, location: str, roads: dict[int, MapRoad]) -> tuple[Connection, ...]:
-        found = []
+        connections_by_id = []
         for element in junction.findall("connection"):
             lane_pairs = tuple(
                 (self.whole(link, "from", location), self.whole(link, "to", location))
@@ -351,8 +351,8 @@ class _Reader:
             for road in (incoming, connecting):
                 if road not in roads:
                     self.fail(location, f"it connects road {road}, which is not in the map")
-            found.append(Connection(incoming, connecting, element.get("contactPoint", "start"), lane_pairs))
-        return tuple(found)
+            connections_by_id.append(Connection(incoming, connecting, element.get("contactPoint", "start"), lane_pairs))
+        return tuple(connections_by_id)
 
     def sections(self, road: Element, location: str, length: float) -> tuple[Section, ...]:
         elements = road.findall("lanes/laneSection")

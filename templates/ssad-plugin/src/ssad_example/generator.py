@@ -7,7 +7,7 @@ from itertools import product
 
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import generator
-from ssad.scenarios.dynamic.search.box import Box
+from ssad.scenarios.dynamic.search.box import ParameterBox
 
 
 class Corners:
@@ -26,13 +26,15 @@ class Corners:
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, margin: float = 0.0) -> None:
         self._points = []
         for base, seed in zip(bases, seeds, strict=True):
-            box = Box.of(base.scenario)
+            box = ParameterBox.of(base.scenario)
             draw = generator("example corners", seed)
-            corners = [list(map(float, corner)) for corner in product((margin, 1 - margin), repeat=min(box.dimension, 6))]
+            corners = [
+                list(map(float, corner)) for corner in product((margin, 1 - margin), repeat=min(box.dimension, 6))
+            ]
             corners = [corner + [0.5] * (box.dimension - len(corner)) for corner in corners]
             order = draw.permutation(len(corners))
             points = [corners[k] for k in order] + draw.random((budget, box.dimension)).tolist()
-            self._points.append([box.at(point) for point in points[:budget]])
+            self._points.append([box.scenario_at(point) for point in points[:budget]])
         self._next = 0
 
     def ask(self, count: int) -> list[list[Proposal]]:

@@ -12,8 +12,8 @@ from helpers.bodies import plain_bodies
 
 from ssad.core.errors import UnknownNameError
 from ssad.core.images import read_image
-from ssad.experiments.perception.physical.lit_images import LitClip, at_hour, lit_clips
-from ssad.recorders.target_images import record_clips
+from ssad.experiments.perception.physical.lit_images import RelightableImage, at_hour, relightable_images
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import HOURS
@@ -22,11 +22,11 @@ from ssad.scenarios.static.physical.lights.light import value_tensors
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, LitClip]]]:
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, RelightableImage]]]:
     out = tmp_path_factory.mktemp("lit") / "clips"
     with plain_bodies():
-        record_clips(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
-        yield out, {hour: next(lit_clips(out, hour)) for hour in ("recorded", "low_sun", "night")}
+        record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+        yield out, {hour: next(relightable_images(out, hour)) for hour in ("recorded", "low_sun", "night")}
 
 
 def test_an_hour_is_clear_and_has_the_suns_direction() -> None:
@@ -43,7 +43,7 @@ def test_an_hour_is_clear_and_has_the_suns_direction() -> None:
 
 
 @pytest.mark.slow
-def test_without_light_it_is_the_recorded_picture(clips: tuple[Path, dict[str, LitClip]]) -> None:
+def test_without_light_it_is_the_recorded_picture(clips: tuple[Path, dict[str, RelightableImage]]) -> None:
     folder, lit = clips
     recorded = read_image(next((folder / "images").iterdir()))
     assert np.array_equal(lit["recorded"].render(), recorded)
@@ -51,7 +51,7 @@ def test_without_light_it_is_the_recorded_picture(clips: tuple[Path, dict[str, L
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hour", ["low_sun", "night"])
-def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, LitClip]], hour: str) -> None:
+def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, RelightableImage]], hour: str) -> None:
     """The quick model and the full picture change alike, around the target; a projector is linear in its picture."""
     clip = clips[1][hour]
     target = clip.target
@@ -62,7 +62,7 @@ def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, LitClip]], hour
     before, after = clip.render().astype(int), clip.render(light.edit(values, target)).astype(int)
     picture = clip.lit()
     quick = picture.show(light.change(value_tensors(values), picture, target))[0].permute(1, 2, 0).numpy() * 255
-    x, y, w, h = next(one["bbox"] for one in clip.clip.objects if one["target"])
+    x, y, w, h = next(one["bbox"] for one in clip.view.objects if one["target"])
     own = (slice(int(y), int(y + h)), slice(int(x), int(x + w)))
     assert np.abs(quick[own] - after[own]).mean() < 6
     if hour == "night":

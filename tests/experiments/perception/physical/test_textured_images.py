@@ -17,9 +17,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import ssad.experiments.perception.physical.textured_images as module
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.experiments.perception.physical.textured_images import KEPT, Wearing, textured_clips
+from ssad.experiments.perception.physical.textured_images import KEPT, PreparedImage, texturable_images
 from ssad.recorders.nuscenes import SENSOR
-from ssad.recorders.target_images import TARGET, clip_views, record_clips
+from ssad.recorders.target_images import TARGET, record_target_images, recorded_views
 from ssad.recorders.target_recording import TargetRecording
 from ssad.recorders.viewpoints import look_at
 from ssad.rendering.camera.render import Rendering, render
@@ -45,7 +45,7 @@ def others_are_boxes() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("textured") / "clips"
-    record_clips(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+    record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
     return out
 
 
@@ -57,8 +57,8 @@ def colours() -> dict[int, torch.Tensor]:
 def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
     """In the whole part that changes; elsewhere the recorded picture stands."""
     textures = colours()
-    for clip, seen in zip(textured_clips(folder, LAYERS), clip_views(folder), strict=True):
-        picture = render(seen.scene, [seen.wearing(*LAYERS)])
+    for clip, seen in zip(texturable_images(folder, LAYERS), recorded_views(folder), strict=True):
+        picture = render(seen.scene, [seen.with_layers(*LAYERS)])
         radiance = torch.tensor(picture.radiance)
         for number, size in SIZES.items():
             radiance = retexture(texture_taps(picture, size, texture=number), textures[number], radiance)
@@ -78,13 +78,13 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
 def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Rendering]:
     """A named car in each of two towns, from the same places: behind its right, and before its left from above."""
     out = tmp_path_factory.mktemp("towns") / "clips"
-    record_clips(
+    record_target_images(
         TargetRecording(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0
     )
     eyes = (np.array([-6.0, -2.5, 1.8]), np.array([5.0, 3.5, 3.0]))
     found = []
-    for seen in clip_views(out):
-        worn = seen.wearing(TextureLayer(0))
+    for seen in recorded_views(out):
+        worn = seen.with_layers(TextureLayer(0))
         at = worn.objects[0].pose
         own = [replace(worn, pose=at @ look_at(eye, np.array([0.0, 0.0, 0.7])), focus=None) for eye in eyes]
         found.append(render(seen.scene, own))
@@ -135,7 +135,7 @@ def test_a_texture_lies_on_the_same_faces_in_every_town(same_metal: list[Renderi
 
 def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(folder / KEPT, ignore_errors=True)  # what other tests had rendered
-    first = list(textured_clips(folder, LAYERS))
+    first = list(texturable_images(folder, LAYERS))
     kept = sorted((folder / KEPT).rglob("*.npz"))
     assert len(kept) == 1
 
@@ -143,25 +143,25 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
         assert not selected_keys, "rendered again"
         yield from ()
 
-    monkeypatch.setattr(module, "clip_views", rendered)
-    for a, b in zip(first, textured_clips(folder, LAYERS), strict=True):
+    monkeypatch.setattr(module, "recorded_views", rendered)
+    for a, b in zip(first, texturable_images(folder, LAYERS), strict=True):
         assert a.file == b.file
         assert np.array_equal(a.radiance, b.radiance)
         assert np.array_equal(a.fragments, b.fragments)
     with pytest.raises(AssertionError, match="rendered again"):
-        next(textured_clips(folder, (TextureLayer(0, opacity=0.9),)))
+        next(texturable_images(folder, (TextureLayer(0, opacity=0.9),)))
     with monkeypatch.context() as other:
         other.setattr(module, "recording_of", lambda *given: {"seed": 1})
         with pytest.raises(AssertionError, match="rendered again"):
-            next(textured_clips(folder, LAYERS))
+            next(texturable_images(folder, LAYERS))
     monkeypatch.setattr(module, "_drawing", lambda: "another version")
     with pytest.raises(AssertionError, match="rendered again"):
-        next(textured_clips(folder, LAYERS))
+        next(texturable_images(folder, LAYERS))
 
 
 def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
     """With windows of unlike sizes, one at the border of the picture, each with a texture and noise of its own."""
-    clip = next(textured_clips(folder, LAYERS))
+    clip = next(texturable_images(folder, LAYERS))
     fragments, width = clip.fragments, clip.radiance.shape[1]
     least = int(fragments["place"].min()) // width
     few = replace(clip, fragments=fragments[fragments["place"] < (least + 20) * width])
@@ -176,7 +176,7 @@ def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
 
     alone = torch.cat([one.show(textures[k], draws(k)) for k, one in enumerate(ready)])
     both = {k: torch.stack([own[k] for own in textures]) for k in SIZES}
-    together = Wearing.together(ready, both, [draws(k) for k in range(3)])
+    together = PreparedImage.together(ready, both, [draws(k) for k in range(3)])
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-5)
     weight = torch.rand(alone.shape, generator=torch.Generator().manual_seed(9))
     leaves = [v for own in textures for v in own.values()]
@@ -204,14 +204,14 @@ class Counted(TorchDispatchMode):
 
 def test_a_further_picture_costs_few_operations(folder: Path) -> None:
     """What bounds a step on a GPU is how many operations are started, not how large they are."""
-    ready = next(textured_clips(folder, LAYERS)).prepare(SIZES)
+    ready = next(texturable_images(folder, LAYERS)).prepare(SIZES)
     counts = []
     for number in (1, 2, 6):
         textures = {k: v.expand(number, *v.shape).clone().requires_grad_() for k, v in colours().items()}
         draws = [torch.Generator().manual_seed(k) for k in range(number)]
-        Wearing.together([ready] * number, textures, draws)  # constants are made once
+        PreparedImage.together([ready] * number, textures, draws)  # constants are made once
         with Counted() as counted:
-            Wearing.together([ready] * number, textures, draws).sum().backward()
+            PreparedImage.together([ready] * number, textures, draws).sum().backward()
         counts.append(counted.count)
     assert counts[0] < 400, counts
     assert counts[2] - counts[1] <= 4 * 8, counts
@@ -219,11 +219,11 @@ def test_a_further_picture_costs_few_operations(folder: Path) -> None:
 
 def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path) -> None:
     surface = RoadPatch(width=1.5, length=3.0).on(TargetCar().mesh())
-    (clip,) = textured_clips(folder, (surface.layer,))
+    (clip,) = texturable_images(folder, (surface.layer,))
     ready = clip.prepare({0: surface.size})
     black, white = (ready.show({0: torch.full((3, *surface.size), value)}) for value in (0.05, 0.9))
     brighter = ((white - black).amax(1)[0] > 0.1).numpy()
-    (seen,) = clip_views(folder)
+    (seen,) = recorded_views(folder)
     picture = render(seen.scene, [seen.view])
     assert (picture.tag[0][brighter] == 0).mean() > 0.9, "on the street"
     x, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
@@ -231,7 +231,7 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     assert brighter.sum() > 0.1 * w * h
     assert rows.mean() > y + h - 2, "nearer than the car"
     assert x < columns.mean() < x + w
-    anew = render(seen.scene, [seen.wearing(surface.layer)])
+    anew = render(seen.scene, [seen.with_layers(surface.layer)])
     radiance = retexture(
         texture_taps(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance)
     )
@@ -241,7 +241,7 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
 
 
 def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:
-    clip = next(textured_clips(folder, LAYERS))
+    clip = next(texturable_images(folder, LAYERS))
     textures = {k: v.requires_grad_() for k, v in colours().items()}
     ready = clip.prepare(SIZES)
     noisy = [ready.show(textures, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
@@ -255,4 +255,4 @@ def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:
         ready.show({0: textures[0]})
     (folder / "annotations" / "train.json").write_text('{"images": [{}]}')
     with pytest.raises(FormatError, match="not the clips of this version"):
-        next(textured_clips(folder, split="train"))
+        next(texturable_images(folder, split="train"))

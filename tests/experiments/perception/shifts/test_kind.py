@@ -17,10 +17,10 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
 from ssad.experiments.perception import open_loop
 from ssad.experiments.perception.scene_boxes import Examination, boxes_path
-from ssad.experiments.perception.scored_data import Recorded, Victims, recording_of
+from ssad.experiments.perception.scored_data import RecordedData, Victims, recording_of
 from ssad.experiments.perception.shifts import kind as shifts_kind
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite, shifted_scene
-from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, deal_severities
 from ssad.scenarios.static.shifts.perturbation import Shift
 
 
@@ -81,7 +81,7 @@ def test_what_a_suite_says_by_default() -> None:
     assert found.shifts == list(SHIFTS)
     assert (found.detectors, found.data, found.version) == (["fcos3d-light", "pgd-det-light"], "recorded", None)
     assert (found.split, found.calibration, found.replicates) == ("val", "physical", 100)
-    recorded = Recorded()
+    recorded = RecordedData()
     assert (recorded.towns, recorded.scenes, recorded.seconds) == (["Oldmarket", "Larkhill"], 12, 8.0)
     assert (recorded.width, recorded.seed) == (800, 0)
 
@@ -185,8 +185,8 @@ def test_scenes_of_a_cell(tmp_path: Path) -> None:
 
     assert of(clean) == [f"clean/{scene}" for scene in SCENES]
     assert of(fog) == [f"fog-3/{scene}" for scene in SCENES]
-    severities = dealt_severities(ShiftSpec("fog", seed=4), list(SCENES.values()))
-    assert severities != dealt_severities(ShiftSpec("fog", seed=5), list(SCENES.values()))
+    severities = deal_severities(ShiftSpec("fog", seed=4), list(SCENES.values()))
+    assert severities != deal_severities(ShiftSpec("fog", seed=5), list(SCENES.values()))
     assert of(dealt) == [f"fog-{severities[token]}/{scene}" for scene, token in SCENES.items()]
     *_, drawn = plan_of(detectors=["one"], calibration="paper").cells
     expected = [shifted_scene("fog", "random", "paper", scene) for scene in SCENES]

@@ -31,19 +31,19 @@ from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.engine.kind import Plan, Resources
 from ssad.engine.local import WORKER_MEMORY
-from ssad.engine.replay import difference
+from ssad.engine.replay import describe_difference
 from ssad.engine.run import run, run_json
 from ssad.experiments.perception import open_loop as detection
 from ssad.experiments.perception.scene_boxes import SceneCondition, boxes_path, find_boxes, forget_failures, read_boxes
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
-from ssad.experiments.perception.shifts.page import left_table, load_detection_run, main_table, robustness_table
+from ssad.experiments.perception.shifts.page import load_detection_run, main_table, remaining_table, robustness_table
 from ssad.experiments.runs import write_report
 from ssad.experiments.suites import load_suite
 from ssad.metrics.detection import match
 from ssad.report.load import load_run
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
-from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import ShiftSpec, deal_severities
 
 ORACLE = "helpers.oracle3d:build"
 
@@ -113,11 +113,11 @@ def test_random_is_put_together_from_the_severities(folder: Path, root: Path) ->
     record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     drawn = {Path(p).name for p in record["artefacts"]["detections"]}
     tokens = [s["token"] for s in json.loads((root / "v1.0-mini" / "scene.json").read_text())]
-    assert drawn == {f"fog-{severity}" for severity in dealt_severities(ShiftSpec("fog"), tokens).values()}
+    assert drawn == {f"fog-{severity}" for severity in deal_severities(ShiftSpec("fog"), tokens).values()}
     assert len(drawn) == len(tokens)
     boxes = {Path(p).name: {f.stem for f in (folder / p).glob("*.npz")} for p in record["artefacts"]["detections"]}
     with NuScenes(root) as data:
-        dealt = dealt_severities(ShiftSpec("fog"), tokens)
+        dealt = deal_severities(ShiftSpec("fog"), tokens)
         assert all(scene.name in boxes[f"fog-{dealt[scene.token]}"] for scene in data.scenes())
 
 
@@ -165,7 +165,7 @@ def test_replay_finds_the_boxes_of_a_cell_again_and_says_what_differs(folder: Pa
     assert (tmp_path / "out" / f"{record['key']}.jpg").stat().st_size > 10_000
     assert not (again / "detections").exists(), "nothing is written to the run"
     changed = {**record, "metrics": record["metrics"] | {"mAP": 0.25}}
-    assert difference(changed, record) == f"metrics: mAP is {record['metrics']['mAP']}, was 0.25"
+    assert describe_difference(changed, record) == f"metrics: mAP is {record['metrics']['mAP']}, was 0.25"
 
 
 def test_cells_are_scored_as_soon_as_their_boxes_are_there(
@@ -215,7 +215,7 @@ def test_the_tables_say_what_the_records_say(folder: Path) -> None:
     found = {(r["shift"], r["severity"]): r["metrics"]["NDS"] for r in lines(folder)}
     left = np.mean([np.mean([found[s, k] for k in (1, 3, 5)]) for s in ("gaussian", "fog")]) / found[None, 0]
     assert cells["mRR (NDS)"].mean == pytest.approx(100 * float(left))
-    share = next(row for row in left_table(run).rows if row.head[1] == "fog").cells[1]
+    share = next(row for row in remaining_table(run).rows if row.head[1] == "fog").cells[1]
     clean = next(r for r in lines(folder) if r["shift"] is None)
     assert share.mean == pytest.approx(100 * drawn["metrics"]["NDS"] / clean["metrics"]["NDS"])
     assert share.interval == ""
@@ -245,7 +245,9 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
     ours = next(row for row in table.rows if row.head[1] == "fog" and not row.published)
     assert len(found) == 3
     assert ours.cells[0].mean == pytest.approx(100 * float(np.mean(found)))
-    shares = {(row.head[1], row.published): row.cells for row in left_table(load_detection_run(load_run(copy))).rows}
+    shares = {
+        (row.head[1], row.published): row.cells for row in remaining_table(load_detection_run(load_run(copy))).rows
+    }
     assert [cell.mean for cell in shares["fog", True]] == pytest.approx([100 * 17.97 / 29.8, 100 * 29.50 / 37.7])
     assert [cell.mean for cell in shares["gaussian noise", True]] == pytest.approx(
         [100 * 3.62 / 29.8, 100 * 6.47 / 37.7]

@@ -39,7 +39,7 @@ def test_places_are_on_driving_lanes_outside_junctions(crossroads: LaneGraph) ->
 @pytest.mark.parametrize("way", ["straight", "left", "right"])
 def test_candidates_keep_freas_rules(way: str, crossroads: LaneGraph, routes: Any) -> None:
     g, route = crossroads, getattr(routes, way)
-    found = natural.candidates(g, route)
+    found = natural.spawn_candidates(g, route)
     own = {(int(g.road[n]), int(g.lane_id[n])) for n in route.lane}
     for place, pose in found:
         key = (int(g.road[place.lane]), int(g.lane_id[place.lane]))
@@ -134,7 +134,7 @@ def test_candidates_are_all_that_freas_rules_allow(way: str, crossroads: LaneGra
         route = route_over(crossroads, [(132, -1), (11, -1)], 5.0)
     else:
         route = getattr(routes, way)
-    found = natural.candidates(crossroads, route)
+    found = natural.spawn_candidates(crossroads, route)
     assert {(place.lane, place.s) for place, _ in found} == allowed(crossroads, route)
     assert all(pose == pose_at(crossroads, place) for place, pose in found)
 
@@ -162,7 +162,7 @@ def test_distances_of_the_rules(limit: float, away: str, crossroads: LaneGraph) 
         lane = np.array([road] * 13 + [inside, road], np.int32)
         ones = np.ones(15, np.float32)
         route = Route(xy.astype(np.float32), 0.0 * ones, lane, ones, ones)
-        return any(other == place for other, _ in natural.candidates(crossroads, route))
+        return any(other == place for other, _ in natural.spawn_candidates(crossroads, route))
 
     near, beyond = kept(limit - 0.01), kept(limit + 0.01)
     assert (near, beyond) == ((False, True) if away == "ego" else (True, False))
@@ -172,7 +172,7 @@ def test_what_stands_ahead_of_the_ego_after_10_m_does_not_count(crossroads: Lane
     route = route_over(crossroads, [(13, 1), (132, -1), (11, -1)], 60.0)
     kept = {
         (int(crossroads.road[p.lane]), int(crossroads.lane_id[p.lane]), p.s)
-        for p, _ in natural.candidates(crossroads, route)
+        for p, _ in natural.spawn_candidates(crossroads, route)
     }
     # in the lane beside the ego's, 2.5 m and 27.5 m ahead of it: 3.5 m aside, so only the first is in the way
     assert (13, 2, 62.5) not in kept
@@ -187,17 +187,20 @@ def test_long_vehicles_turn_only_where_they_can() -> None:
     straight = polyline_route(np.array([[0.0, 0.0], [50.0, 0.0]]))
     for name in ("car", "bus", "truck", "motorcycle"):
         body = model(name)
-        assert natural.fits(name, straight)
+        assert natural.fits_route(name, straight)
         # half the length times the slip, k wheelbase / 2, and half the width may reach 2.2 m
         tightest = 0.25 * body.length * body.wheelbase / (2.2 - 0.5 * body.width)
-        assert natural.fits(name, bend(1.05 * tightest))
-        assert not natural.fits(name, bend(0.95 * tightest))
+        assert natural.fits_route(name, bend(1.05 * tightest))
+        assert not natural.fits_route(name, bend(0.95 * tightest))
     # a single kink is spread over 3 m
     kink = replace(straight, yaw=np.where(np.arange(51) < 25, 0.0, 0.09).astype(np.float32))
-    assert natural.fits("bus", kink) == natural.fits("bus", bend(3.0 / 0.09))
+    assert natural.fits_route("bus", kink) == natural.fits_route("bus", bend(3.0 / 0.09))
     # and points 2 m apart are half as bent
     wide = replace(bend(10.0), spacing=2.0)
-    assert (natural.fits("bus", bend(10.0)), natural.fits("bus", wide)) == (False, natural.fits("bus", bend(20.0)))
+    assert (natural.fits_route("bus", bend(10.0)), natural.fits_route("bus", wide)) == (
+        False,
+        natural.fits_route("bus", bend(20.0)),
+    )
 
 
 def test_the_mix_of_vehicles() -> None:
@@ -228,7 +231,7 @@ def test_speeds_are_those_of_the_parameters_and_of_the_road(crossroads: LaneGrap
     assert 8.7 < max(found) <= 9.0
     assert np.mean(found) == pytest.approx(6.0, abs=0.7)
     assert set(speeds(crossroads, 1, speed=6.0, speed_spread=0.0)) == {6.0}
-    slow = replace(crossroads, speed_limit=np.full(crossroads.lanes, 5.0, np.float32))
+    slow = replace(crossroads, speed_limit=np.full(crossroads.lane_count, 5.0, np.float32))
     assert set(speeds(slow, 1, speed=6.0, speed_spread=0.0)) == {5.0}
 
 

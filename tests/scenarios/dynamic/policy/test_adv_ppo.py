@@ -71,7 +71,7 @@ def test_it_raises_the_collision_rate_of_the_autopilot_on_the_road() -> None:
     found = bases(*range(70))
     outcomes = search(AdvPPO(found, seeds=[0] * 70, budget=1), found, TRIALS, budget=1)
     assert sum(base.trace.end == "collision" for base in found) <= 1
-    assert sum(row[0].valid for row in outcomes) >= 0.17 * 70
+    assert sum(row[0].is_valid for row in outcomes) >= 0.17 * 70
 
 
 def test_weights_are_small() -> None:

@@ -11,7 +11,7 @@ import pytest
 from helpers.boxes import cars
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, U8
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images, shift_points
@@ -30,7 +30,7 @@ def drive(length: float = 60.0) -> F64:
     return np.array([upright_pose(3.0, float(y), np.pi / 2, SLOPE * y) for y in np.arange(0.0, length + 0.1, 2.0)])
 
 
-def shown(frame: Frame, *objects: StandingObject, picture: U8 = GREY) -> tuple[U8, Applied]:
+def shown(frame: Frame, *objects: StandingObject, picture: U8 = GREY) -> tuple[U8, ShiftReport]:
     """A picture with objects on its road."""
     contexts = {frame.scene: SceneContext(frame.scene, objects=objects)}
     out, done = shift_images(picture, replace(frame, scene=frame.scene), ShiftSpec("anomaly", 5), contexts=contexts)

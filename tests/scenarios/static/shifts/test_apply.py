@@ -27,7 +27,7 @@ from ssad.scenarios.static.shifts import (
     KNOWN,
     SHIFTS,
     ShiftSpec,
-    dealt_severities,
+    deal_severities,
     random_severity,
     shift_images,
     shift_points,
@@ -463,27 +463,27 @@ def test_severity_is_drawn_by_scene_or_by_sample() -> None:
 @given(scenes=st.sets(st.text("abc0123", min_size=1, max_size=6), max_size=40), seed=st.integers(0, 99))
 def test_severities_are_dealt_evenly(scenes: set[str], seed: int) -> None:
     spec = ShiftSpec("fog", seed=seed)
-    dealt = dealt_severities(spec, scenes)
+    dealt = deal_severities(spec, scenes)
     assert set(dealt) == scenes
     counts = [sum(value == severity for value in dealt.values()) for severity in (1, 2, 3, 4, 5)]
     assert sum(counts) == len(scenes)
     assert max(counts) - min(counts) <= 1
-    assert dealt_severities(spec.at(5), sorted(scenes, reverse=True)) == dealt, "the order they come in decides"
+    assert deal_severities(spec.at(5), sorted(scenes, reverse=True)) == dealt, "the order they come in decides"
 
 
 def test_dealt_severities_differ_by_shift_and_seed() -> None:
     scenes = [f"scene-{k}" for k in range(24)]
     specs = [ShiftSpec(name, seed=seed) for name in ("fog", "snow", "scale") for seed in range(3)]
-    assert len({tuple(sorted(dealt_severities(spec, scenes).items())) for spec in specs}) == 9
-    first = {dealt_severities(ShiftSpec("fog", seed=seed), scenes)["scene-0"] for seed in range(60)}
+    assert len({tuple(sorted(deal_severities(spec, scenes).items())) for spec in specs}) == 9
+    first = {deal_severities(ShiftSpec("fog", seed=seed), scenes)["scene-0"] for seed in range(60)}
     assert first == {1, 2, 3, 4, 5}
 
 
 def test_a_deal_begins_anywhere() -> None:
     """Else a single scene would always have severity 1, and of six scenes two."""
-    alone = [dealt_severities(ShiftSpec("fog", seed=seed), ["scene"])["scene"] for seed in range(200)]
+    alone = [deal_severities(ShiftSpec("fog", seed=seed), ["scene"])["scene"] for seed in range(200)]
     assert {alone.count(severity) > 20 for severity in (1, 2, 3, 4, 5)} == {True}
-    six = [list(dealt_severities(ShiftSpec("fog", seed=seed), "abcdef").values()) for seed in range(60)]
+    six = [list(deal_severities(ShiftSpec("fog", seed=seed), "abcdef").values()) for seed in range(60)]
     assert {severity for dealt in six for severity in dealt if dealt.count(severity) == 2} == {1, 2, 3, 4, 5}
 
 

@@ -15,7 +15,7 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_points, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.lidar import fog_response, is_inside_box
-from ssad.scenarios.static.shifts.objects import affine, deformed
+from ssad.scenarios.static.shifts.objects import box_maps, deformed_box_maps
 from ssad.scenarios.static.shifts.sun import sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
 
@@ -72,7 +72,7 @@ def test_range_noise_is_along_the_beam() -> None:
 def test_points_move_with_their_object() -> None:
     boxes = replace(cars((10.0, 1.5, 0.8)), rotation=np.array([[np.cos(0.4), 0, 0, np.sin(0.4)]]))
     rng = np.random.default_rng(2)
-    matrix, centre = affine(boxes)
+    matrix, centre = box_maps(boxes)
     local = rng.uniform(-0.5, 0.5, (500, 3)) * 0.98
     cloud = np.zeros((900, 5), np.float32)
     cloud[:500, :3] = local @ matrix[0].T + centre[0]
@@ -81,12 +81,12 @@ def test_points_move_with_their_object() -> None:
     for name in ("scale", "rotation", "shear"):
         spec = ShiftSpec(name, 4, 5)
         out, done = shift_points(cloud, frame, spec)
-        new, new_centre = deformed(spec, boxes, scene="s", sample="a")
+        new, new_centre = deformed_box_maps(spec, boxes, scene="s", sample="a")
         assert out[:500, :3] == pytest.approx(local @ new[0].T + new_centre[0], abs=1e-4)
         assert (out[500:] == cloud[500:]).all()
         assert done.details == {"objects": 1, "points": 500}
         label = transformed_boxes(spec, boxes, scene="s", sample="a")
-        assert is_inside_box(out[:500], affine(label)[0][0] * 1.0001, label.centre[0]).all()
+        assert is_inside_box(out[:500], box_maps(label)[0][0] * 1.0001, label.centre[0]).all()
     moving = replace(boxes, velocity=np.array([[3.0, 4.0, 0.0]]))
     out, _ = shift_points(cloud, replace(frame, boxes=moving), ShiftSpec("motion_blur", 5))
     smear = (out - cloud)[:500, :3]
@@ -98,7 +98,7 @@ def test_the_paper_scales_one_axis_and_keeps_the_object_on_the_ground() -> None:
     boxes = cars((10.0, 1.5, 0.8))
     for seed in range(8):
         spec = ShiftSpec("scale", 5, seed, "paper")
-        new, centre = deformed(spec, boxes, scene="s", sample="a", lidar=True)
+        new, centre = deformed_box_maps(spec, boxes, scene="s", sample="a", lidar=True)
         ratio = np.linalg.norm(new[0], axis=0) / boxes.size_lwh[0]
         assert sorted(np.abs(np.round(ratio - 1, 9))) == pytest.approx([0, 0, 0.2])
         assert centre[0, 2] - np.linalg.norm(new[0], axis=0)[2] / 2 == pytest.approx(0, abs=1e-9)

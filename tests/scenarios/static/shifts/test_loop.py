@@ -75,7 +75,7 @@ def test_objects_are_changed_or_added_and_the_rest_of_the_picture_stays(followin
 def test_the_boxes_of_objects_are_where_they_are_and_move_as_they_do(following) -> None:
     world, agents = following
     onboard, state = Onboard(), world.state()
-    boxes, own = boxes_of(onboard.sights(world, agents)[1], state.speed[1])
+    boxes, own = boxes_of(onboard.agent_views(world, agents)[1], state.speed[1])
     np.testing.assert_allclose(boxes.centre[:, :2], state.pose[1, 1:, :2])
     np.testing.assert_allclose(boxes.size_lwh[:, :2], state.size[1, 1:], atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(boxes.velocity, axis=1), np.abs(state.speed[1, 1:]), atol=1e-5)

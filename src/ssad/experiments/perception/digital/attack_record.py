@@ -17,7 +17,7 @@ from ssad.experiments.perception.scene_boxes import (
     find_boxes,
     picture_truth_of,
     read_scenes,
-    score_found,
+    score_boxes,
     system_of,
     truth_of,
 )
@@ -54,7 +54,7 @@ def attack_record(
     truth = truth_of(examination, [condition.scene for condition in clean_scenes])
     clean_boxes, _ = read_scenes(examination, system, clean_scenes)
     # Under an attack the clean score is only a reference; its intervals stand in the clean record.
-    clean_result = score_found(examination, system, clean_boxes, truth, replicates=replicates if not specs else 0)
+    clean_result = score_boxes(examination, system, clean_boxes, truth, replicates=replicates if not specs else 0)
     if not specs:
         return {**clean_result, "metrics": clean_result["metrics"] | scorer.by_distance(clean_boxes, truth)}
     member_scenes = [scenes[start : start + len(clean_scenes)] for start in range(0, len(scenes), len(clean_scenes))]
@@ -66,7 +66,7 @@ def attack_record(
     if len(specs) > 1:
         candidates = dict(zip((spec.name for spec in specs), member_boxes, strict=True))
         worst_column["worst"], boxes = worst_of(candidates, truth, scorer.match(truth))
-    attacked_result = score_found(examination, system, boxes, truth, replicates=replicates)
+    attacked_result = score_boxes(examination, system, boxes, truth, replicates=replicates)
     metrics = attacked_result["metrics"] | scorer.by_distance(boxes, truth)
     clean_score = clean_result["metrics"]["mAP"]
     metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None

@@ -14,7 +14,7 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
-from ssad.experiments.perception.sheets import WIDTH, richest, tile
+from ssad.experiments.perception.sheets import WIDTH, draw_tile, frame_with_most_objects
 from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
 from ssad.scenarios.static.digital.spec import AttackSpec
 
@@ -37,7 +37,7 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
     detector = detector_of(name, weights, examination.device)
     rows = []
     with NuScenes(examination.root, examination.version) as dataset:
-        scene, frame = richest(dataset, scenes_of(dataset, split))
+        scene, frame = frame_with_most_objects(dataset, scenes_of(dataset, split))
         clean_image = read_image(examination.root / frame.filename)
         for spec in [None, *specs]:
             monitored, image = MonitoredDetector(detector), clean_image
@@ -48,7 +48,7 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
                     continue
             title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"
             title += f", {spec.target}" if spec and spec.target else ""
-            detection_tile = tile((monitored, examination.device), scene, frame, image, title="what it finds")
+            detection_tile = draw_tile((monitored, examination.device), scene, frame, image, title="what it finds")
             change = magnified(image, clean_image)
             rows.append(
                 np.concatenate([_shrunk(image, title), _shrunk(change, "change, magnified"), detection_tile], 1)

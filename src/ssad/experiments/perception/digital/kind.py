@@ -170,7 +170,7 @@ class Digital(OpenLoopKind):
 
     def settings(self, suite: DigitalSuite, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
         """Return the batch size, the defended detectors, and towns and numbers of camera images of the scenes."""
-        defended = {
+        defended_systems = {
             system_name(detector, defence): [detector, defence.name, dict(defence.options)]
             for detector in (split_weights(text)[0] for text in suite.detectors)
             for defence in dict.fromkeys(guard_of(suite, attack) for attack in suite.attacks if attack.defence)
@@ -178,7 +178,7 @@ class Digital(OpenLoopKind):
         }
         return {
             "batch": suite.batch,
-            "defended": defended,
+            "defended": defended_systems,
             "towns": {name: scene.log.location if scene.log else "" for name, scene in scenes.items()},
             "images": {
                 name: sum(frame.modality == "camera" and frame.key_frame for frame in scene.frames)

@@ -107,7 +107,7 @@ def main_table(run: DigitalRun) -> Table:
         return [TableRow.of_published(*published_row)] if published_row else []
 
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
-    note += run.about_flat
+    note += run.note_on_2d
     if any(published_scores(run, setting) for setting in run.rows):
         note += (
             f" Shaded rows: {SOURCE}; ours are other pictures and other detectors, so the share of the clean score "
@@ -320,7 +320,11 @@ def curves(run: DigitalRun, axis: Literal["radius", "steps"], metric: str = "mAP
     groups: dict[Setting, set[float]] = {}
     for setting in run.settings:
         value = setting[3] if axis == "radius" else setting[4]
-        if setting.plain and setting.attack not in ("", "noise", "ensemble") and (axis == "steps" or value <= FURTHEST):
+        if (
+            setting.is_plain
+            and setting.attack not in ("", "noise", "ensemble")
+            and (axis == "steps" or value <= FURTHEST)
+        ):
             groups.setdefault(_setting_at(setting, axis, 0), set()).add(value)
     plots = []
     for group, values in groups.items():
@@ -396,18 +400,18 @@ def tiles(run: DigitalRun) -> list[dict[str, Any]]:
     return entries
 
 
-def summary(found: Run) -> Table:
+def summary(stored_run: Run) -> Table:
     """Return the table for the terminal: percent, and the verdict of the audit."""
-    run = load_digital_run(found)
+    run = load_digital_run(stored_run)
     verdict = audit(attempts_of(run))
     lines = ["percent", verdict.text, *(f"{fault.detector}: {fault.text}" for fault in verdict.faults[:5])]
     lines += filter(None, [short_of(run).strip()])
     return replace(main_table(run), note="\n".join(lines))
 
 
-def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a digital run and its tables."""
-    run = load_digital_run(found)
+    run = load_digital_run(stored_run)
     verdict = audit(attempts_of(run))
     main_rows, losses, effort = main_table(run), lost_table(run), effort_table(run)
     all_cells, class_scores, audit_rows = every_table(run), class_table(run), audit_table(verdict)
@@ -416,7 +420,7 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
     distances = distance_table(run)
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=sentences,
         others=other_tables,
         distances=distances,
@@ -431,7 +435,7 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
         tiles=tiles(run),
         plot=curves(run, "radius"),
         plot_steps=curves(run, "steps"),
-        pictures=pictures(found.folder),
+        pictures=pictures(stored_run.folder),
         samples=max(int(r.get("n", 0)) for r in run.records.values()),
         scenes=run.scenes,
         failures=[

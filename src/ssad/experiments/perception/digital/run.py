@@ -61,7 +61,7 @@ class Setting(NamedTuple):
         return self.defence, self.subset
 
     @property
-    def plain(self) -> bool:
+    def is_plain(self) -> bool:
         """True for an untargeted attack on the bare evaluated detector."""
         return not self.source and not self.defence and not self.target
 
@@ -104,18 +104,18 @@ class DigitalRun:
         transfer_detectors = [_called(text) for text in self.suite.get("transfer_detectors", [])]
         return [*self.detectors, *transfer_detectors]
 
-    def flat(self, detector: str) -> bool:
+    def is_2d(self, detector: str) -> bool:
         """Return whether a detector finds 2D boxes."""
         return any(name == detector and record.get("task") == "2d" for (name, _), record in self.records.items())
 
     def metrics(self, detector: str) -> tuple[str, ...]:
         """Return the headline metrics of a detector."""
-        return ("mAP",) if self.flat(detector) else ("mAP", "NDS")
+        return ("mAP",) if self.is_2d(detector) else ("mAP", "NDS")
 
     @property
-    def about_flat(self) -> str:
+    def note_on_2d(self) -> str:
         """Remark on 2D detectors for notes; "" where there is none."""
-        names = [name for name in self.all_detectors if self.flat(name)]
+        names = [name for name in self.all_detectors if self.is_2d(name)]
         if not names:
             return ""
         return f" mAP of {' and '.join(names)}: AP50 of 2D boxes in the images, mean over the classes that are there."

@@ -62,7 +62,7 @@ def transfer_table(run: DigitalRun) -> Table:
         columns={detector: detector for detector in run.all_detectors},
         metric=metric,
         note="mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was "
-        f"asked of the detector that is shown the pictures.{run.about_flat}",
+        f"asked of the detector that is shown the pictures.{run.note_on_2d}",
     )
 
 
@@ -145,7 +145,7 @@ def black_box_table(run: DigitalRun) -> Table:
     """Return attacks that follow no gradient of the images that they change, beside noise of the same size."""
 
     def is_black_box(setting: Setting, record: Mapping[str, Any]) -> bool:
-        attacked = setting.plain and setting.attack not in ("", "noise")
+        attacked = setting.is_plain and setting.attack not in ("", "noise")
         return attacked and record["status"] == "ok" and record["access"] != "white-box"
 
     def metric(row: DetectorSetting, column: str) -> TableCell:
@@ -204,7 +204,7 @@ def halving_table(run: DigitalRun) -> Table:
     """Return for each curve over the budget the radius that halves mAP, and the mAP at 1 px."""
     radii: dict[Setting, set[float]] = {}
     for setting in run.settings:
-        if setting.plain and setting.attack not in ("", "noise", "ensemble"):
+        if setting.is_plain and setting.attack not in ("", "noise", "ensemble"):
             radii.setdefault(setting._replace(radius=0.0), set()).add(setting.radius)
 
     def metric(group: Setting, column: tuple[str, str]) -> TableCell:
@@ -257,7 +257,7 @@ def distance_table(run: DigitalRun) -> Table:
     return Table.listing(
         "distances",
         "By distance",
-        [row for row in product(run.detectors, run.rows) if not run.flat(row[0])],
+        [row for row in product(run.detectors, run.rows) if not run.is_2d(row[0])],
         rows=with_detector(ATTACK),
         columns={
             f"{metric}_{band}": f"{metric}, {band_title}"

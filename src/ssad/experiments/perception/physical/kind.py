@@ -14,11 +14,16 @@ from ssad.core.protocols import Detector
 from ssad.core.run_records import COUNT, SHARE
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 from ssad.experiments.perception.open_loop import CellDescription, OpenLoopKind, Sightings, TargetCondition
 from ssad.experiments.perception.physical import page
-from ssad.experiments.perception.physical.lit_images import LightableClips
-from ssad.experiments.perception.physical.target_attacks import SearchedLight, TargetAttacks, TrainedTexture, see_all
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
+from ssad.experiments.perception.physical.target_attacks import (
+    SearchedLight,
+    TargetAttacks,
+    TrainedTexture,
+    render_all_surfaces,
+)
 from ssad.experiments.perception.physical.target_sheets import write_sheets
 from ssad.experiments.perception.physical.target_table import CLEAN, GRID, TargetTable, rows_of, target_of
 from ssad.experiments.perception.physical.verdict import verdict
@@ -126,8 +131,10 @@ class Physical(OpenLoopKind):
         specs = [TextureSpec.of_row(cell.spec) for cell in plan.cells if cell.spec["attack"]]
         surfaces = list(dict.fromkeys(spec.surface for spec in specs))
         if surfaces:
-            with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as progress:
-                see_all(
+            with LiveProgress(
+                "rendering what wears textures", 1, 0, console=resources.console, unit="parts"
+            ) as progress:
+                render_all_surfaces(
                     self.recordings(plan, folder),
                     plan.suite.target,
                     surfaces,
@@ -139,14 +146,18 @@ class Physical(OpenLoopKind):
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Return the training of the cell's texture, or the search of its light, unless it is done."""
-        made = perturbation_of(cell, job)
-        return {f"{made.family} {made.name}": cell} if made is not None and made.is_missing else {}
+        perturbation = perturbation_of(cell, job)
+        return (
+            {f"{perturbation.family} {perturbation.name}": cell}
+            if perturbation is not None and perturbation.is_missing
+            else {}
+        )
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """Train a texture, or search a light."""
-        made = perturbation_of(data, job)
-        assert made is not None
-        made.make()
+        perturbation = perturbation_of(data, job)
+        assert perturbation is not None
+        perturbation.make()
 
     def target(self, cell: Cell, job: Job, detector: Detector) -> TargetCondition:
         """Return the images in the town of the test, at the hour of the light, and the texture or light."""
@@ -154,19 +165,19 @@ class Physical(OpenLoopKind):
         pair = (light or cell.spec)["pair"]
         folder = job.folder / "data" / f"{pair['test']}{'-grid' if is_grid else ''}"
         count = job.settings["grid"] if is_grid else pair["test_images"]
-        images = LightableClips.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
+        images = RelightableTargetImages.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
         name = class_of_target(parse_target(job.settings["target"])).replace("_", " ")
         return TargetCondition(images, perturbation_of(cell, job), f"{name} ({light['hour']})" if light else name)
 
     def target_columns(
-        self, cell: Cell, job: Job, shown: TargetCondition, clean: Sightings, attacked: Sightings | None
+        self, cell: Cell, job: Job, condition: TargetCondition, clean: Sightings, attacked: Sightings | None
     ) -> dict[str, Any]:
         """Return the scores of the grid by view, and the record of the texture or light."""
         columns: dict[str, Any] = {}
         if cell.fields["view"] == GRID:
-            columns = grid_scores(shown.images.rows(), clean, attacked, floor=job.settings["floor"])
-        made = shown.perturbation
-        return columns | made.about() if isinstance(made, TrainedTexture | SearchedLight) else columns
+            columns = grid_scores(condition.images.rows(), clean, attacked, floor=job.settings["floor"])
+        perturbation = condition.perturbation
+        return columns | perturbation.about() if isinstance(perturbation, TrainedTexture | SearchedLight) else columns
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
@@ -208,7 +219,7 @@ def perturbation_of(cell: Cell, job: Job) -> TrainedTexture | SearchedLight | No
     return attacks.light(LightSpec.of_row(light)) if light else attacks.texture(TextureSpec.of_row(cell.spec))
 
 
-def shown_by(folder: Path, name: str) -> tuple[TargetAttacks, Cell]:
+def attacks_and_cell(folder: Path, name: str) -> tuple[TargetAttacks, Cell]:
     """Return the textures and lights of a physical run, and one of its cells.
 
     Args:

@@ -15,9 +15,9 @@ from ssad.core.detections import Truth
 from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
-from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
-from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
-from ssad.recorders.target_images import TARGET, ClipView, clip_rows, clip_views
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages, drive_of, target_truth
+from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturableImage, visible_part
+from ssad.recorders.target_images import TARGET, RecordedView, image_rows, recorded_views
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
@@ -29,23 +29,23 @@ QUALITY: Final = 92  # of JPEG, as it is recorded
 
 
 @dataclass(frozen=True, slots=True)
-class LitClip:
+class RelightableImage:
     """A recorded image at an hour.
 
     Attributes:
-        clip: The image.
+        view: The image.
         scene: Its street and bodies, and `BLIND`.
         cards: Index of `BLIND` in the scene.
     """
 
-    clip: ClipView
+    view: RecordedView
     scene: RenderScene
     cards: int
 
     @property
     def target(self) -> TargetSize:
         """Size of the target."""
-        length, width, height = self.clip.row["target_size"]
+        length, width, height = self.view.row["target_size"]
         return TargetSize(length, width, height)
 
     def render(self, edit: SceneEdit = NO_EDIT) -> U8:
@@ -53,25 +53,25 @@ class LitClip:
         scene, first_card = self.scene, self.cards + 1
         if edit.cards:
             key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
-            scene = self.scene.cached(
+            scene = self.scene.compute_once(
                 key,
                 lambda: RenderScene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device),
             )
-        view = edit.on(self.clip.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
+        view = edit.on(self.view.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
         rendering = render_with(scene, [view], edit.textures, edit.masks)
         # Detectors see recordings through JPEG, so edited images must pass through it as well.
         return decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
 
-    def projected(self, edit: SceneEdit) -> TexturedClip:
+    def projected(self, edit: SceneEdit) -> TexturableImage:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
-        rendering = render(self.scene, [edit.on(self.clip.view, TARGET)])
-        visible = seen_part(rendering)
+        rendering = render(self.scene, [edit.on(self.view.view, TARGET)])
+        visible = visible_part(rendering)
         corner = int(visible["corner"][0]), int(visible["corner"][1])
         image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
-        return TexturedClip(
-            self.clip.file,
-            self.clip.row,
-            self.clip.objects,
+        return TexturableImage(
+            self.view.file,
+            self.view.row,
+            self.view.objects,
             image,
             corner,
             visible["radiance"],
@@ -81,14 +81,14 @@ class LitClip:
 
     def lit(self, device: str | torch.device = "cpu") -> LitImage:
         """Return the image as a function of the light on its target."""
-        rows, columns = _part(self.clip)
-        return render_lit_image(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
+        rows, columns = _part(self.view)
+        return render_lit_image(self.scene, self.view.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
-def _part(clip: ClipView) -> tuple[slice, slice]:
+def _part(view: RecordedView) -> tuple[slice, slice]:
     """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
-    (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in clip.objects if annotation["target"])
-    height, width = clip.view.camera.height, clip.view.camera.width
+    (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in view.objects if annotation["target"])
+    height, width = view.view.camera.height, view.view.camera.width
     half_extent = max(box_width, box_height) / 2 + MARGIN / 2
     slices = []
     for start, extent, limit in ((y, box_height, height), (x, box_width, width)):
@@ -97,7 +97,7 @@ def _part(clip: ClipView) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
-def lit_clips(
+def relightable_images(
     folder: Path,
     hour: str,
     *,
@@ -105,16 +105,16 @@ def lit_clips(
     count: int | None = None,
     split: str = "all",
     stages: dict[Any, Any] | None = None,
-) -> Iterator[LitClip]:
+) -> Iterator[RelightableImage]:
     """The pictures of a recording at an hour, in order.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         hour: See `HOURS`.
         device: Where to render.
         count: How many; None for all.
         split: train, test or all.
-        stages: See `clip_views`.
+        stages: See `recorded_views`.
 
     Raises:
         FormatError: No recording of this version.
@@ -122,9 +122,9 @@ def lit_clips(
     """
     # Reject an unknown hour before any scene is built.
     at_hour(SceneWeather(), hour)
-    file_names = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
+    file_names = {row["file_name"] for row, _ in image_rows(folder, split)[:count]}
     scene_pair: tuple[RenderScene, RenderScene] | None = None
-    for recorded in clip_views(
+    for recorded in recorded_views(
         folder,
         split=split,
         device=device,
@@ -138,12 +138,12 @@ def lit_clips(
                 recorded.scene,
                 RenderScene(recorded.scene.street, [*recorded.scene.meshes, BLIND.mesh()], device=device),
             )
-        yield LitClip(recorded, scene_pair[1], len(recorded.scene.meshes))
+        yield RelightableImage(recorded, scene_pair[1], len(recorded.scene.meshes))
 
 
 @lru_cache(maxsize=4)
-def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ...]:
-    return tuple(lit_clips(folder, hour, count=count, device=device, stages=_stages(folder, device)))
+def _cached_images(folder: Path, hour: str, count: int, device: str) -> tuple[RelightableImage, ...]:
+    return tuple(relightable_images(folder, hour, count=count, device=device, stages=_stages(folder, device)))
 
 
 @lru_cache(maxsize=2)
@@ -153,7 +153,7 @@ def _stages(folder: Path, device: str) -> dict[Any, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class LightableClips(TargetClips):
+class RelightableTargetImages(RecordedTargetImages):
     """Recorded images of a target that can wear textures, and be shown at another hour in any light.
 
     It is the `TargetImages` of `ssad.scenarios.static.perturbation`.
@@ -175,7 +175,7 @@ class LightableClips(TargetClips):
         Raises:
             FormatError: The folder holds no recording of this version.
         """
-        return TargetClips.clean(self) if self.hour is None else self.lit(self.hour, NO_EDIT)
+        return RecordedTargetImages.clean(self) if self.hour is None else self.lit(self.hour, NO_EDIT)
 
     def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at an hour and with an edit around the target.
@@ -184,18 +184,18 @@ class LightableClips(TargetClips):
             FormatError: The folder holds no recording of this version.
             UnknownNameError: There is no such hour.
         """
-        for lit_image in self.clips_at(hour):
+        for lit_image in self.images_at(hour):
             tensor = torch.from_numpy(lit_image.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(lit_image.clip.row), tensor, self.lit_truth(lit_image)
+            yield drive_of(lit_image.view.row), tensor, self.lit_truth(lit_image)
 
-    def clips_at(self, hour: str) -> tuple[LitClip, ...]:
+    def images_at(self, hour: str) -> tuple[RelightableImage, ...]:
         """Return the images at an hour; they are kept, since scenes take longer to make than images.
 
         Raises:
             FormatError, UnknownNameError: See `lit`.
         """
-        return _kept(self.folder, hour, self.count, self.device)
+        return _cached_images(self.folder, hour, self.count, self.device)
 
-    def lit_truth(self, clip: LitClip) -> Truth:
+    def lit_truth(self, image: RelightableImage) -> Truth:
         """Return the truth of an image at an hour."""
-        return target_truth(clip.clip.row, clip.clip.objects, self.classes)
+        return target_truth(image.view.row, image.view.objects, self.classes)

@@ -66,11 +66,13 @@ class PhysicalRun:
     @cached_property
     def records(self) -> Mapping[tuple[str, str, str, Shown], list[Line]]:
         """Records by town of the test, view, detector, and attack."""
-        found: dict[tuple[str, str, str, Shown], list[Line]] = {}
+        lines_by_key: dict[tuple[str, str, str, Shown], list[Line]] = {}
         for line in self.run.lines:
             attack_key = (line["attack"], line["carrier"], line["source"])
-            found.setdefault((line["test"], line.get("view", "drive"), line["detector"], attack_key), []).append(line)
-        return found
+            lines_by_key.setdefault((line["test"], line.get("view", "drive"), line["detector"], attack_key), []).append(
+                line
+            )
+        return lines_by_key
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -231,7 +233,7 @@ def margin_table(run: PhysicalRun) -> Table:
         attack_lines = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
         controls = [control for control in run.attacks if control[1] == carrier and learns_nothing(control[0], name)]
         differences = [
-            (paired_gap(draw, line), control)
+            (paired_ap_difference(draw, line), control)
             for control, line in product(controls, attack_lines)
             for draw in run.lines(test, "drive", detector, control)
         ]
@@ -388,7 +390,7 @@ def comparison_table(run: PhysicalRun) -> Table:
     def metric(pair: tuple[Line, Line], column: str) -> TableCell:
         strongest, other = pair
         if column == "difference":
-            return paired_gap(other, strongest)
+            return paired_ap_difference(other, strongest)
         return score([strongest if column == "strongest" else other], "AP50")
 
     return Table.listing(
@@ -410,12 +412,18 @@ def comparison_table(run: PhysicalRun) -> Table:
     )
 
 
-def paired_gap(more: Line, less: Line) -> TableCell:
+def paired_ap_difference(larger_record: Line, smaller_record: Line) -> TableCell:
     """Return the difference of the AP50 of two records in percent; its interval where both are of the same images."""
-    difference, count, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
-    if (count, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
+    difference, count, drives = (
+        larger_record["metrics"]["AP50"] - smaller_record["metrics"]["AP50"],
+        int(larger_record["n"]),
+        int(larger_record["drives"]),
+    )
+    if (count, drives) != (smaller_record["n"], smaller_record["drives"]) or not (
+        larger_record.get("replicates") and smaller_record.get("replicates")
+    ):
         return TableCell(100.0 * difference)
-    pairs = zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False)
+    pairs = zip(*(line["replicates"]["AP50"] for line in (larger_record, smaller_record)), strict=False)
     return TableCell.of(
         replicate_difference(difference, [first - second for first, second in pairs], n=count, clusters=drives).scaled(
             100.0
@@ -474,8 +482,8 @@ def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[t
 def _weather_map(line: Line, title: str, *, clean: bool) -> HeatMap:
     """Return the map of a record by elevation and weather."""
     hits: dict[tuple[str, str], list[bool]] = {}
-    for _, _, elevation, weather, before, after in line["views"]:
-        hits.setdefault((f"{elevation:g}°", weather), []).append((before if clean else after) > 0.25)
+    for _, _, elevation, weather, clean_scores, attacked_scores in line["views"]:
+        hits.setdefault((f"{elevation:g}°", weather), []).append((clean_scores if clean else attacked_scores) > 0.25)
     rows, columns = (list(dict.fromkeys(position[axis] for position in hits)) for axis in (0, 1))
     values = {position: sum(views) / len(views) for position, views in hits.items()}
     tips = {position: f"{title}: {sum(views)} of {len(views)} views" for position, views in hits.items()}
@@ -487,11 +495,11 @@ def _map(line: Line, title: str, *, clean: bool) -> HeatMap:
     """Return the map of a record by distance and azimuth."""
     values: dict[tuple[str, str], float | None] = {}
     tips = {}
-    for distance, azimuth, count, before, after in line["cells"]:
+    for distance, azimuth, count, clean_scores, attacked_scores in line["cells"]:
         position = (f"{distance:g} m", f"{azimuth:g}°")
-        values[position] = before if clean else after
-        attacked_text = "n/a" if after is None else f"{100 * after:.1f}"
-        clean_text = "n/a" if before is None else f"{100 * before:.1f}"
+        values[position] = clean_scores if clean else attacked_scores
+        attacked_text = "n/a" if attacked_scores is None else f"{100 * attacked_scores:.1f}"
+        clean_text = "n/a" if clean_scores is None else f"{100 * clean_scores:.1f}"
         tips[position] = (
             f"{title}, {position[0]}, {position[1]}: AP50 clean "
             f"{clean_text}{'' if clean else f', attacked {attacked_text}'}, {count} views"
@@ -536,22 +544,22 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
     return entries
 
 
-def summary(found: Run) -> Table:
+def summary(stored_run: Run) -> Table:
     """Return the table for the terminal."""
     return replace(
-        main_table(PhysicalRun(found), 0), note=f"Percent, of the target alone. {rate_note(floor_of(found))}"
+        main_table(PhysicalRun(stored_run), 0), note=f"Percent, of the target alone. {rate_note(floor_of(stored_run))}"
     )
 
 
-def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a physical run and its tables."""
-    run = PhysicalRun(found)
+    run = PhysicalRun(stored_run)
     main_tables = [main_table(run, number) for number in range(len(run.pairs))]
     margin_rows, others, effort = margin_table(run), others_table(run), effort_table(run)
     further_tables = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=verdict,
         main=main_tables,
         margins=margin_rows,
@@ -561,7 +569,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         tiles=tiles(run),
         maps=maps(run),
         weathers=weather_maps(run),
-        pictures=pictures(found.folder),
+        pictures=pictures(stored_run.folder),
         failures=[
             (
                 line["test"],
@@ -571,7 +579,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
                 line["source"],
                 line.get("reason", ""),
             )
-            for line in found.failures
+            for line in stored_run.failures
         ],
     )
     return page, [*main_tables, margin_rows, *further_tables, others, effort]

@@ -15,21 +15,21 @@ from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.detections import Truth
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
-from ssad.detectors import loaded_detector
+from ssad.detectors import cached_detector
 from ssad.engine.pool import open_pool, run_all
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
-from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
+from ssad.experiments.perception.physical.textured_images import cache_texture_images, uncached_parts
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import Perturbation, TargetImages
 from ssad.scenarios.static.physical import TextureSpec, TextureSurface, TextureView, albedo_of, make_carrier
-from ssad.scenarios.static.physical.lights import LitView, TargetSize
+from ssad.scenarios.static.physical.lights import SearchView, TargetSize
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
 from ssad.scenarios.static.physical.textures.carrier import covered_colour
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
@@ -65,12 +65,12 @@ class TargetAttacks:
 
     def detector(self, name: str) -> Detector:
         """Return a detector, loaded on first use."""
-        detector: Detector = loaded_detector(name, device=self.device)
+        detector: Detector = cached_detector(name, device=self.device)
         return detector
 
-    def clips(self, recording: str, count: int, detector: str) -> LightableClips:
+    def images(self, recording: str, count: int, detector: str) -> RelightableTargetImages:
         """Return the first images of a recording, clean or ready for a texture."""
-        return LightableClips.of(self.folder / "data" / recording, count, self.detector(detector), self.device)
+        return RelightableTargetImages.of(self.folder / "data" / recording, count, self.detector(detector), self.device)
 
     def texture(self, spec: TextureSpec) -> TrainedTexture:
         """Return a texture as a perturbation of the target."""
@@ -83,7 +83,7 @@ class TargetAttacks:
     def sheet(
         self,
         detector: str,
-        clips: LightableClips,
+        images: RelightableTargetImages,
         *,
         textures: Mapping[str, TextureSpec],
         sides: Sequence[float | None],
@@ -93,15 +93,15 @@ class TargetAttacks:
 
         Args:
             detector: Whose boxes are drawn.
-            clips: Of the recording.
+            images: Of the recording.
             textures: By title.
             sides: One view from each (azimuth in degrees); None: the first view.
             clean: Title of the pictures as they were recorded.
         """
         victim = self.detector(detector)
         # A count beyond every recording counts its images.
-        all_images = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
-        rows = all_images.rows()
+        whole_recording = replace(images, count=len(replace(images, count=1 << 30).rows()))
+        rows = whole_recording.rows()
         view_numbers = [index for side in sides for index in _from(rows, side)] or [0]
 
         def select(pictures: Iterator[tuple[str, Tensor, Truth]]) -> list[tuple[str, Tensor, Truth]]:
@@ -111,9 +111,11 @@ class TargetAttacks:
                 if view_index in view_numbers
             ]
 
-        textured_views = {title: select(self.texture(spec).on_target(all_images)) for title, spec in textures.items()}
+        textured_views = {
+            title: select(self.texture(spec).on_target(whole_recording)) for title, spec in textures.items()
+        }
         sheets = []
-        for index, (_, image, truth) in enumerate(select(all_images.clean())):
+        for index, (_, image, truth) in enumerate(select(whole_recording.clean())):
             titled_images = [
                 (clean, image),
                 *((title, selected[index][1]) for title, selected in textured_views.items()),
@@ -126,7 +128,7 @@ class TargetAttacks:
         """Draw the first image of a recording under lights: by title the hour and the light (None: none)."""
         victim, titled_images = self.detector(detector), []
         for title, (hour, spec) in lights.items():
-            images = replace(self.clips(recording, 1, detector), hour=hour)
+            images = replace(self.images(recording, 1, detector), hour=hour)
             ((_, tensor, truth),) = images.clean() if spec is None else self.light(spec).on_target(images)
             titled_images.append((title, tensor))
         return target_sheet(victim, titled_images, truth, self.device)
@@ -165,9 +167,9 @@ class TrainedTexture(Perturbation):
         surface = surface_of(attacks.target, spec.surface)
 
         def views() -> list[TextureView]:
-            image_sets = [attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
+            image_sets = [attacks.images(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
-                image_sets.append(attacks.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
+                image_sets.append(attacks.images(f"{spec.pair['train']}-around", spec.around, spec.source))
             return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
 
         base_paint = paint_under(attacks.target, spec.surface)
@@ -221,8 +223,8 @@ class SearchedLight(Perturbation):
         car = parse_target(attacks.target)
         assert isinstance(car, TargetCar)
 
-        def training_images() -> LightableClips:
-            return attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)
+        def training_images() -> RelightableTargetImages:
+            return attacks.images(spec.pair["train"], spec.pair["train_images"], spec.source)
 
         def projected(edit: SceneEdit) -> list[TextureView]:
             texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
@@ -231,12 +233,14 @@ class SearchedLight(Perturbation):
                 TextureView(
                     clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip)
                 )
-                for clip in images.clips_at(spec.hour)
+                for clip in images.images_at(spec.hour)
             ]
 
-        def views() -> list[LitView]:
+        def views() -> list[SearchView]:
             images = training_images()
-            return [LitView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
+            return [
+                SearchView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.images_at(spec.hour)
+            ]
 
         return attacks.lights.edit(
             spec,
@@ -260,18 +264,18 @@ class SearchedLight(Perturbation):
         return {"artefacts": artefacts, **lights.history(spec)}
 
 
-def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
+def render_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
     """Render and store the contribution of carriers to the images of a part, in a worker.
 
     Args:
         task: Folder of the recording, number of the part, target, `TextureSpec.surface` of each, device.
     """
     folder, part_number, target, surfaces, device = task
-    quiet_warp()
-    see_clips(folder, layers_of(target, surfaces), part=part_number, device=device)
+    start_warp_quietly()
+    cache_texture_images(folder, layers_of(target, surfaces), part=part_number, device=device)
 
 
-def see_all(
+def render_all_surfaces(
     recordings: Sequence[TargetRecording],
     target: str,
     surfaces: Sequence[str],
@@ -291,15 +295,15 @@ def see_all(
         (recording.out, part_number, target, surfaces, recording.device)
         for recording in recordings
         if surfaces
-        for part_number in unseen_parts(recording.out, layers_of(target, surfaces))
+        for part_number in uncached_parts(recording.out, layers_of(target, surfaces))
     ]
     if tasks:
         pool = open_pool(len(tasks), workers=workers, ray=ray, device=recordings[0].device)
-        run_all(pool, see_surfaces, tasks, progress=progress)
+        run_all(pool, render_surfaces, tasks, progress=progress)
 
 
 def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[TextureLayer | TextureDecal, ...]]:
-    """Where textures go, each alone, as `see_clips` takes them."""
+    """Where textures go, each alone, as `cache_texture_images` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Truth
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors.drawing import FOUND, clear_detections
@@ -21,13 +21,13 @@ AROUND = 4.0  # side of what is shown, in longer sides of the target's box
 
 @torch.no_grad()
 def target_sheet(
-    detector: Detector, shown: Sequence[tuple[str, Tensor]], truth: Truth, device: str, columns: int = COLUMNS
+    detector: Detector, titled_pictures: Sequence[tuple[str, Tensor]], truth: Truth, device: str, columns: int = COLUMNS
 ) -> U8:
     """Parts of pictures side by side, each with its title and the boxes that a detector finds in the whole picture.
 
     Args:
         detector: Whose boxes are drawn.
-        shown: Titles and pictures [1, 3, H, W] in 0 to 1.
+        titled_pictures: Titles and pictures [1, 3, H, W] in 0 to 1.
         truth: What is in them, the target first; what is around it is shown.
         device: Where the detector is.
         columns: Pictures in a row.
@@ -36,7 +36,7 @@ def target_sheet(
         [H, W, 3] RGB.
     """
     tiles, target_box = [], truth.box[0].tolist()
-    for title, image in shown:
+    for title, image in titled_pictures:
         detections = clear_detections(detector, image.to(device), truth.intrinsic)
         full_image = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
         left, top, side = _square(target_box, full_image.shape[1], full_image.shape[0])
@@ -55,7 +55,7 @@ def target_sheet(
             text, text_position = f"{detector.classes[label]} {score:.2f}", (max(x0, 4), max(y0 - 6, 20))
             for colour, width in (((0, 0, 0), 5), (FOUND, 2)):
                 cv2.putText(crop, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
-        tiles.append(captioned(crop, title, WIDTH))
+        tiles.append(add_caption(crop, title, WIDTH))
     while len(tiles) % columns:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[start : start + columns], 1) for start in range(0, len(tiles), columns)]

@@ -8,7 +8,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.images import save_picture
 from ssad.detectors.drawing import LEAST
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.physical.target_attacks import TargetAttacks
 from ssad.experiments.perception.physical.target_table import CLEAN, GRID, Pair, TargetTable, options_title
 from ssad.scenarios.static.physical import TextureSpec
@@ -50,7 +50,7 @@ def write_sheets(attacks: TargetAttacks, table: TargetTable, cells: Cells) -> No
         ):
             path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
             recording = folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}"
-            target_images = LightableClips(recording, 1, device=attacks.device)
+            target_images = RelightableTargetImages(recording, 1, device=attacks.device)
             if pair_textures and not path.is_file() and (target_images.folder / "annotations").is_dir():
                 save_picture(
                     path, attacks.sheet(detector_name, target_images, textures=sheet_textures, sides=sides, clean=CLEAN)

@@ -198,7 +198,7 @@ class TargetTable(Schema):
             TargetRecording, held_out=(), target=target, size=self.size, seed=self.seed, device=device
         )
         mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
-        found = [
+        recordings_by_name = [
             make_recording(
                 folder / "data" / town,
                 ((town, count),),
@@ -210,7 +210,7 @@ class TargetTable(Schema):
         ]
         if self.grid is not None:
             grid = self.grid
-            found += [
+            recordings_by_name += [
                 make_recording(
                     folder / "data" / f"{town}-grid",
                     ((town, grid.count),),
@@ -224,8 +224,10 @@ class TargetTable(Schema):
             ]
         around_count = max((entry.around for entry in self.attacks), default=0)
         for town in dict.fromkeys(pair.train for pair in self.pairs) if around_count else ():
-            found.append(make_recording(folder / "data" / f"{town}-around", ((town, around_count),), mode="orbit"))
-        return found
+            recordings_by_name.append(
+                make_recording(folder / "data" / f"{town}-around", ((town, around_count),), mode="orbit")
+            )
+        return recordings_by_name
 
 
 def rows_of(table: TargetTable) -> Iterator[CellDescription]:
@@ -321,28 +323,28 @@ def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[st
         return {one["source"]} if "file" in one else set(table.detectors)
 
     similar_settings = [
-        _said(table, other_row)
+        _stated_settings(table, other_row)
         for other_row in rows
         if row_identity(other_row) == row_identity(row) and sources(other_row) & sources(row)
     ]
     name, _, around = row_identity(row)
     side_text, prefix = ", all sides" if around else "", "shuffled " if row["of"] else ""
-    return f"{prefix}{name}{side_text}{_differing(_said(table, row), similar_settings)}"
+    return f"{prefix}{name}{side_text}{_differing_settings(_stated_settings(table, row), similar_settings)}"
 
 
-def _said(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
+def _stated_settings(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a row beyond its attack, its carrier and the defaults of the table."""
     table_defaults = {"epochs": table.epochs, "window": table.window}
     further = {"around": row["around"] or None, "texture": row.get("file")}
     return {key: value for key, value in {**row["settings"], **further}.items() if value != table_defaults.get(key)}
 
 
-def _differing(own: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+def _differing_settings(own_settings: Mapping[str, Any], other_settings: Sequence[Mapping[str, Any]]) -> str:
     """Stealth, and what others do not say alike: such as ", rate 0.01"."""
     differences = (
         (key, value)
-        for key, value in own.items()
-        if (key == "stealth" and value) or any(other.get(key) != value for other in others)
+        for key, value in own_settings.items()
+        if (key == "stealth" and value) or any(other.get(key) != value for other in other_settings)
     )
     return "".join(f", {key} {_words(value)}" for key, value in differences)
 
@@ -364,7 +366,7 @@ def _light_title(table: TargetTable, row: Mapping[str, Any]) -> str:
         for other_entry in table.lights
         if (other_entry.name, other_entry.hour, other_entry.options) == light_identity
     ]
-    return f"{row['attack']}{_differing(row['settings'], similar_settings)}"
+    return f"{row['attack']}{_differing_settings(row['settings'], similar_settings)}"
 
 
 def options_title(row: Mapping[str, Any]) -> str:
@@ -386,7 +388,7 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
     row: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
     row |= {"of": None, "around": entry.around}
     if entry.texture is not None:
-        return row | _ready(table, entry)
+        return row | _card_fields(table, entry)
     if entry.name not in CONTROLS:
         settings = {"epochs": table.epochs, "window": table.window}
         settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
@@ -409,17 +411,20 @@ def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
         for row in rows
         if entry.carrier in (None, row["carrier"])
         and entry.texture in (None, row.get("file"))
-        and _within({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
+        and _is_subset({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
     ]
-    row_settings = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in matching_rows]
+    row_settings = [
+        {"carrier": row["carrier"], **row["options"], **_stated_settings(table, row)} for row in matching_rows
+    ]
     plainest = [
         row
         for row, candidate_settings in zip(matching_rows, row_settings, strict=True)
-        if all(_within(candidate_settings, other_settings) for other_settings in row_settings)
+        if all(_is_subset(candidate_settings, other_settings) for other_settings in row_settings)
     ]
     if not plainest:
         choices = "; ".join(
-            f"{carrier_title(row)}{_differing(_said(table, row), [{}])}" for row in matching_rows or rows
+            f"{carrier_title(row)}{_differing_settings(_stated_settings(table, row), [{}])}"
+            for row in matching_rows or rows
         )
         hint = (
             f"; {'several fit' if matching_rows else 'none fits'}, say carrier, options, settings or "
@@ -431,9 +436,9 @@ def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
     return plainest[0]
 
 
-def _within(some: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
+def _is_subset(subset: Mapping[str, Any], superset: Mapping[str, Any]) -> bool:
     """Whether all that one says the other says too."""
-    return {**more, **some} == more
+    return {**superset, **subset} == superset
 
 
 def check_lights(table: TargetTable) -> None:
@@ -453,7 +458,7 @@ def carrier_title(row: Mapping[str, Any]) -> str:
     return ", ".join([row.get("carrier", ""), *(f"{key} {value}" for key, value in options)])
 
 
-def _ready(table: TargetTable, entry: Entry) -> dict[str, Any]:
+def _card_fields(table: TargetTable, entry: Entry) -> dict[str, Any]:
     """Return the fields of a row that the card of a texture sets.
 
     Raises:

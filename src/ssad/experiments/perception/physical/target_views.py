@@ -17,17 +17,17 @@ from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import NO_ATTRIBUTE
-from ssad.experiments.perception.physical.textured_images import textured_clips
-from ssad.recorders.target_images import CLASSES, clip_rows
+from ssad.experiments.perception.physical.textured_images import texturable_images
+from ssad.recorders.target_images import CLASSES, image_rows
 from ssad.scenarios.static.physical import TextureSurface, TextureView
 
 
 @dataclass(frozen=True, slots=True)
-class TargetClips:
+class RecordedTargetImages:
     """The first images of a recording, for a detector.
 
     Attributes:
-        folder: Folder that `record_clips` wrote.
+        folder: Folder that `record_target_images` wrote.
         count: Number of images.
         classes: Names of the detector's classes, in its order.
         device: Device that renders and shows them.
@@ -46,7 +46,7 @@ class TargetClips:
         Raises:
             FormatError: The folder holds no recording of this version.
         """
-        return [row for row, _ in clip_rows(self.folder)[: self.count]]
+        return [row for row, _ in image_rows(self.folder)[: self.count]]
 
     def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, as recorded.
@@ -54,7 +54,7 @@ class TargetClips:
         Raises:
             FormatError: See `rows`.
         """
-        for row, objects in clip_rows(self.folder)[: self.count]:
+        for row, objects in image_rows(self.folder)[: self.count]:
             tensor = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
             yield (
                 drive_of(row),
@@ -75,7 +75,7 @@ class TargetClips:
             ConfigError: None of the images shows any of the texture; raised after the last.
         """
         is_visible = False
-        for textured in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
+        for textured in islice(texturable_images(self.folder, (surface.layer,), device=self.device), self.count):
             prepared = textured.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             is_visible |= bool(len(prepared.taps[0].pixel))
             truth = target_truth(textured.row, textured.objects, self.classes, whole=self.whole)
@@ -96,7 +96,7 @@ def target_truth(
         row: Of the picture.
         objects: What is in it.
         classes: Names of the detector's classes.
-        whole: See `TargetClips`.
+        whole: See `RecordedTargetImages`.
 
     Raises:
         ConfigError: The detector does not know the target's class.

@@ -24,12 +24,12 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
-from ssad.recorders.target_images import ClipView, clip_rows, clip_views, recording_of
+from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
 from ssad.rendering.camera.render import Rendering, render
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
-from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, large_draws
+from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generators_on_device
 
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
@@ -37,13 +37,13 @@ BLOCK = 16  # px: parts begin at blocks of JPEG
 
 
 @dataclass(frozen=True, slots=True)
-class TexturedClip:
+class TexturableImage:
     """A recorded picture whose target wears textures.
 
     Attributes:
         file: Its name in the folder `images`.
         row: What the annotation file says of it.
-        objects: What is annotated in it (see `ClipView`).
+        objects: What is annotated in it (see `RecordedView`).
         image: As recorded, uint8 RGB [H, W, 3].
         corner: Row and column at which `radiance` begins in it.
         radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
@@ -68,7 +68,7 @@ class TexturedClip:
         quality: int | None = 92,
         sensor: SensorModel = SENSOR,
         device: str | torch.device = "cpu",
-    ) -> Wearing:
+    ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
 
         Args:
@@ -90,7 +90,9 @@ class TexturedClip:
         (top, left), (height, width) = self.corner, self.image.shape[:2]
         rectangle = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
         taps = {
-            number: _moved(texture_taps(self, texture_size, texture=number, mask=masks.get(number)), rectangle, width)
+            number: _move_taps(
+                texture_taps(self, texture_size, texture=number, mask=masks.get(number)), rectangle, width
+            )
             for number, texture_size in sizes.items()
         }
         touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
@@ -98,11 +100,11 @@ class TexturedClip:
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
-        return Wearing(window, radiance.to(device), self.exposure, device_taps, recorded_image)
+        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image)
 
 
 @dataclass(frozen=True, slots=True)
-class Wearing:
+class PreparedImage:
     """Image that is ready for textures.
 
     Attributes:
@@ -130,12 +132,12 @@ class Wearing:
             ConfigError: See `together`.
         """
         batched_textures = {number: texture[None] for number, texture in textures.items()}
-        return Wearing.together([self], batched_textures, None if noise is None else [noise])
+        return PreparedImage.together([self], batched_textures, None if noise is None else [noise])
 
     @classmethod
     def together(
         cls,
-        pictures: Sequence[Wearing],
+        pictures: Sequence[PreparedImage],
         textures: Mapping[int, Tensor],
         noise: Sequence[torch.Generator] | None = None,
     ) -> Tensor:
@@ -156,7 +158,7 @@ class Wearing:
         return cls.developed(pictures, radiance, window, noise)
 
     @staticmethod
-    def lit(pictures: Sequence[Wearing], textures: Mapping[int, Tensor]) -> tuple[Tensor, ChangedWindow]:
+    def lit(pictures: Sequence[PreparedImage], textures: Mapping[int, Tensor]) -> tuple[Tensor, ChangedWindow]:
         """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
         first_window, batch_size = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
@@ -185,14 +187,17 @@ class Wearing:
 
     @staticmethod
     def developed(
-        pictures: Sequence[Wearing], radiance: Tensor, window: ChangedWindow, noise: Sequence[torch.Generator] | None
+        pictures: Sequence[PreparedImage],
+        radiance: Tensor,
+        window: ChangedWindow,
+        noise: Sequence[torch.Generator] | None,
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
         noise_sample = None
         if noise is not None:
             mosaic = window.sensor.mosaic
             noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
-            generators = large_draws(noise, radiance.device)
+            generators = generators_on_device(noise, radiance.device)
             for image_noise, prepared, read_rectangle, rng in zip(
                 noise_sample, pictures, window.read, generators, strict=True
             ):
@@ -205,51 +210,51 @@ class Wearing:
         return window.paste(window.develop(radiance, exposure, noise_sample), recorded_images)
 
 
-def _overlap(own: Rectangle, wanted: Rectangle) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+def _overlap(source: Rectangle, target: Rectangle) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Where the pixels that two rectangles share lie in the wanted one, and in one's own."""
     intersection = [
         (max(own_span[0], wanted_span[0]), min(own_span[1], wanted_span[1]))
-        for own_span, wanted_span in zip(own, wanted, strict=True)
+        for own_span, wanted_span in zip(source, target, strict=True)
     ]
     wanted_slices, own_slices = (
         tuple(
             slice(start - span[0], max(start, stop) - span[0])
             for (start, stop), span in zip(intersection, sides, strict=True)
         )
-        for sides in (wanted, own)
+        for sides in (target, source)
     )
     return wanted_slices, own_slices
 
 
-def _cut(values: Tensor, own: Rectangle, wanted: Rectangle) -> Tensor:
+def _cut(values: Tensor, source: Rectangle, target: Rectangle) -> Tensor:
     """What values [h, w, ...] of a rectangle are in another one; 0 outside of their own."""
-    if own == wanted:
+    if source == target:
         return values
-    wanted_slices, own_slices = _overlap(own, wanted)
-    window_values = values.new_zeros((*(stop - start for start, stop in wanted), *values.shape[2:]))
+    wanted_slices, own_slices = _overlap(source, target)
+    window_values = values.new_zeros((*(stop - start for start, stop in target), *values.shape[2:]))
     window_values[wanted_slices] = values[own_slices]
     return window_values
 
 
-def _moved(taps: Taps, own: Rectangle, width: int) -> Taps:
+def _move_taps(taps: Taps, rectangle: Rectangle, width: int) -> Taps:
     """Taps into a rectangle as taps into the whole picture, which is so wide."""
-    (rows, columns), rectangle_width = own, own[1][1] - own[1][0]
+    (rows, columns), rectangle_width = rectangle, rectangle[1][1] - rectangle[1][0]
     return replace(
         taps, pixel=(taps.pixel // rectangle_width + rows[0]) * width + taps.pixel % rectangle_width + columns[0]
     )
 
 
-def textured_clips(
+def texturable_images(
     folder: Path,
     layers: Sequence[TextureLayer | TextureDecal] = (TextureLayer(0),),
     *,
     split: str = "all",
     device: str = "cpu",
-) -> Iterator[TexturedClip]:
+) -> Iterator[TexturableImage]:
     """Yield the images of a recording whose targets have layers, in order; each is rendered once and then stored.
 
     Args:
-        folder: Folder that `record_clips` wrote; results are stored in its folder `.seen`.
+        folder: Folder that `record_target_images` wrote; results are stored in its folder `.seen`.
         layers: Layers and decals of the targets.
         split: train, test or all.
         device: Device that renders.
@@ -258,46 +263,46 @@ def textured_clips(
         FormatError: The folder holds no recording of this version, or a stored file is broken.
         StoreError: The folder cannot be written to.
     """
-    cache_folder = _kept_in(folder, layers, split)
-    rows = clip_rows(folder, split)
+    cache_folder = _cache_folder(folder, layers, split)
+    rows = image_rows(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
-    missing_views = clip_views(folder, split=split, device=device, selected_keys=missing_files)
+    missing_views = recorded_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
         file = row["file_name"]
         if file in missing_files:
             safeio.make_folder(cache_folder)
             # The views come in the order of the rows, so the next one belongs to this row.
-            safeio.save_npz(cache_folder / f"{file}.npz", _kept(next(missing_views), layers))
+            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers))
         cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
         corner = int(cached["corner"][0]), int(cached["corner"][1])
         exposure = float(cached["exposure"])
-        yield TexturedClip(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
+        yield TexturableImage(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
 
 
-def unseen_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
+def uncached_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
     """Return the parts of a recording that are not fully cached for each of several sets of layers.
 
     Raises:
         FormatError: The folder holds no recording of this version.
     """
-    cache_folders = [_kept_in(folder, layers, "all") for layers in variants]
+    cache_folders = [_cache_folder(folder, layers, "all") for layers in variants]
     cached_names = [{path.name for path in cache_folder.glob("*.npz")} for cache_folder in cache_folders]
     missing_parts = (
         row["part"]
-        for row, _ in clip_rows(folder)
+        for row, _ in image_rows(folder)
         if any(f"{row['file_name']}.npz" not in names for names in cached_names)
     )
     return list(dict.fromkeys(missing_parts))
 
 
-def see_clips(
+def cache_texture_images(
     folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]], *, part: int, device: str = "cpu"
 ) -> None:
-    """Render what a part of a recording shows of each of several sets of layers, for `textured_clips`.
+    """Render what a part of a recording shows of each of several sets of layers, for `texturable_images`.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         variants: What the targets wear, one set after the other.
         part: Whose pictures.
         device: Where to render.
@@ -306,25 +311,25 @@ def see_clips(
         FormatError: No recording of this version.
         StoreError: Nothing can be written there.
     """
-    cache_folders = [_kept_in(folder, layers, "all") for layers in variants]
+    cache_folders = [_cache_folder(folder, layers, "all") for layers in variants]
     for cache_folder in cache_folders:
         safeio.make_folder(cache_folder)
-    file_names = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
-    for recorded in clip_views(folder, device=device, selected_keys=file_names):
+    file_names = {row["file_name"] for row, _ in image_rows(folder) if row["part"] == part}
+    for recorded in recorded_views(folder, device=device, selected_keys=file_names):
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():
-                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _kept(recorded, layers))
+                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers))
 
 
-def _kept_in(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
+def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
     """Return the cache folder of a set of layers."""
     keys = [_layer_key(layer) for layer in layers]
     # The source is part of the key: another version may render other bits.
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def seen_part(picture: Rendering) -> dict[str, Any]:
+def visible_part(picture: Rendering) -> dict[str, Any]:
     """What is kept of one rendered picture: the part around what shows textures."""
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
@@ -339,16 +344,16 @@ def seen_part(picture: Rendering) -> dict[str, Any]:
     }
 
 
-def _kept(clip: ClipView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return seen_part(render(clip.scene, [clip.wearing(*layers)]))
+def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
+    return visible_part(render(view.scene, [view.with_layers(*layers)]))
 
 
-def _span(places: Any, most: int) -> tuple[int, int]:
+def _span(places: Any, limit: int) -> tuple[int, int]:
     """Where a part begins and ends that holds all places and their margin; a block if there are none."""
     if not len(places):
-        return 0, min(BLOCK, most)
+        return 0, min(BLOCK, limit)
     start = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
-    return start, min(int(places.max()) + MARGIN + 1, most)
+    return start, min(int(places.max()) + MARGIN + 1, limit)
 
 
 def _layer_key(layer: TextureLayer | TextureDecal) -> tuple[object, ...]:

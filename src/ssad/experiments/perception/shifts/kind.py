@@ -23,7 +23,7 @@ from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.scenarios.static.catalogue import parse_perturbation, registered_names
 from ssad.scenarios.static.perturbation import Perturbation
-from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, deal_severities
 from ssad.scenarios.static.shifts.perturbation import Shift
 
 OWN = "own"  # family of the shifts of packages and of the user
@@ -99,7 +99,7 @@ class Detection(OpenLoopKind):
             return [shifted_scene(shift, severity, calibration, scene) for scene in tokens]
         # A shift of the user's own has no specification: it is dealt like uniform noise.
         spec = ShiftSpec(shift if shift in KNOWN else "uniform", seed=cell.seed, calibration=calibration)
-        severity_by_token = dealt_severities(spec, tokens.values())
+        severity_by_token = deal_severities(spec, tokens.values())
         return [shifted_scene(shift, severity_by_token[token], calibration, scene) for scene, token in tokens.items()]
 
     def sheet(

@@ -145,7 +145,7 @@ def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> T
     return score_cell(run, mean, means, records[0]["n"])
 
 
-def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
+def remaining_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
     """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
     clean_record, shifted_cell = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
     if clean_record is None or math.isnan(shifted_cell.mean) or not clean_record["metrics"].get(metric):
@@ -227,7 +227,7 @@ def score_columns(run: DetectionRun) -> dict[tuple[str, str], str]:
     return {(detector, metric): f"{detector} {metric}" for detector in run.detectors for metric in SCORES}
 
 
-def left_table(run: DetectionRun) -> Table:
+def remaining_table(run: DetectionRun) -> Table:
     """Return shift x detector: the share of the clean score that is left, the paper's shares between ours."""
     names = published_names(run)
     has_published = any(names) and any(shift in PUBLISHED for shift in run.shifts)
@@ -248,7 +248,7 @@ def left_table(run: DetectionRun) -> Table:
         run.shifts,
         rows=factors(run),
         columns=score_columns(run),
-        metric=lambda shift, column: left_cell(run, column[0], shift, column[1]),
+        metric=lambda shift, column: remaining_cell(run, column[0], shift, column[1]),
         published=published,
         note="Percent of each detector's own clean score, which is what other pictures and detectors can be compared "
         "by." + (f" Shaded rows: from the numbers {SOURCE}." if has_published else ""),
@@ -366,7 +366,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
 
         # the baseline's mCE is 1 by definition, so its replicates do not vary
         draws = 0 if name == "mCE" and detector == baseline else len(replicates_of(records[detector, ""][0], score))
-        resampled = [value(partial(_draw, score=score, draw=draw)) for draw in range(draws)]
+        resampled = [value(partial(_replicate_score, score=score, draw=draw)) for draw in range(draws)]
         count = next(iter(run.records.values())).get("n", 0)
         return score_cell(run, value(lambda record: record["metrics"][score]), resampled, count, bounded=False)
 
@@ -382,7 +382,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
     )
 
 
-def _draw(record: Mapping[str, Any], score: str, draw: int) -> float:
+def _replicate_score(record: Mapping[str, Any], score: str, draw: int) -> float:
     """Return a replicate of a score."""
     return replicates_of(record, score)[draw]
 
@@ -455,18 +455,18 @@ def summary(run: Run) -> Table:
     return replace(main_table(load_detection_run(run)), note=note)
 
 
-def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a detection run and its tables."""
-    run = load_detection_run(found)
+    run = load_detection_run(stored_run)
     robustness, order = robustness_table(run), order_table(run)
-    main_rows, left_rows, severities = main_table(run), left_table(run), severity_table(run)
+    main_rows, remaining_rows, severities = main_table(run), remaining_table(run), severity_table(run)
     car_rows, class_rows = car_table(run), class_table(run)
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=verdict,
         main=main_rows,
-        left=left_rows,
+        left=remaining_rows,
         order=order,
         severities=severities,
         cars=car_rows,
@@ -475,7 +475,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         tiles=tiles(run, robustness),
         plot=curves(run),
         plot_map=curves(run, "mAP"),
-        pictures=pictures(found.folder),
+        pictures=pictures(stored_run.folder),
         samples=max(int(record.get("n", 0)) for record in run.records.values()),
         scenes=run.scenes,
         skipped=_skipped(run),
@@ -485,7 +485,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
             if record["status"] != "ok"
         ],
     )
-    tables = main_rows, left_rows, order, robustness, severities, car_rows, class_rows
+    tables = main_rows, remaining_rows, order, robustness, severities, car_rows, class_rows
     return page, [table for table in tables if table is not None]
 
 

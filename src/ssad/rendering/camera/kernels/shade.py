@@ -30,7 +30,7 @@ class Geometry:
 
 
 @wp.struct
-class Drawn:
+class DrawRanges:
     """Ranges of listed faces, each under one matrix (see `ssad.rendering.camera.scene.DrawCalls`).
 
     Attributes:
@@ -120,7 +120,7 @@ class Hit:
 
 
 @wp.struct
-class Lit:
+class PointLight:
     """Light on a point.
 
     Attributes:
@@ -135,7 +135,7 @@ class Lit:
 
 
 @wp.struct
-class Seen:
+class SurfaceLight:
     """Light that a surface sends to the camera: its colour, and its gain per unit of albedo."""
 
     colour: wp.vec3
@@ -151,7 +151,7 @@ def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column
 
 
 @wp.func
-def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
+def sun_share(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
     """Return the share of the sun that reaches a point, from four weighted texels of a shadow map.
 
     p: the point in texels, and in metres along the light. Points outside the map give -1.
@@ -180,17 +180,17 @@ def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
     """Return the share of the sun that reaches a point with a normal, by the fine map if it contains the point."""
     texel = shadows.fine_texel
     # The offset along the normal keeps a surface from shading itself.
-    share = sunlit(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
+    share = sun_share(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
     if share < 0.0:
         texel = shadows.wide_texel
-        share = sunlit(shadows.wide, view, wp.transform_point(shadows.to_wide[view], p + n * (texel * 1.5)), texel)
+        share = sun_share(shadows.wide, view, wp.transform_point(shadows.to_wide[view], p + n * (texel * 1.5)), texel)
     if share < 0.0:
         share = 1.0
     return share
 
 
 @wp.func
-def hit_of(geometry: Geometry, draw_samples: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
+def hit_of(geometry: Geometry, draw_samples: DrawRanges, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
     """Intersect a ray (camera frame, z = 1) with the plane of a slot's face, clamped to its edges."""
     hit = Hit()
     owner = draw_samples.owners[slot / 2]
@@ -231,11 +231,11 @@ def hit_of(geometry: Geometry, draw_samples: Drawn, slot: int, ray: wp.vec3, pos
 
 
 @wp.func
-def lit_at(
+def light_at(
     light: Light, shadows: SunShadows, near: Near, view: int, row: int, p: wp.vec3, n: wp.vec3, open_: float
-) -> Lit:
+) -> PointLight:
     """Return all light on a point with a normal, except from lamps that project a texture."""
-    lit = Lit()
+    lit = PointLight()
     lit.open_ = open_
     facing = wp.dot(n, light.sun)
     if facing > 0.0:
@@ -255,7 +255,7 @@ def lit_at(
 
 
 @wp.func
-def seen_from(
+def reflected_light(
     light: Light,
     near: Near,
     row: int,
@@ -263,11 +263,11 @@ def seen_from(
     albedo: wp.vec3,
     glow: float,
     hit: Hit,
-    lit: Lit,
+    lit: PointLight,
     away: wp.vec3,
-) -> Seen:
+) -> SurfaceLight:
     """Return the light that a lit surface sends back along a unit ray: its own colour, reflections, and fog."""
-    result = Seen()
+    result = SurfaceLight()
     n = hit.normal
     p = hit.place
     colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
@@ -331,7 +331,7 @@ def seen_from(
 
 
 @wp.func
-def keep(out: Output, fragment: Fragment):
+def list_fragment(out: Output, fragment: Fragment):
     """List a fragment if there is room."""
     # Fragments beyond the room are still counted, so that `render` can report the overflow.
     position = wp.atomic_add(out.found, 0, 1)
@@ -370,11 +370,11 @@ def project(
                 piece.v = 0.5 + 0.5 * spot[1]
                 piece.area = spot[2] * span
                 piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (irradiance * open_)
-                keep(out, piece)
+                list_fragment(out, piece)
 
 
 @wp.func
-def left_by(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int) -> float:
+def remaining_own_colour(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int) -> float:
     """Return the share of a surface's own colour that its layers and the decals leave."""
     remaining = float(1.0)
     if wearable == 1:
@@ -386,7 +386,7 @@ def left_by(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int
 
 
 @wp.func
-def wear(
+def list_layer_fragments(
     out: Output,
     all: Layers,
     view: int,
@@ -415,7 +415,7 @@ def wear(
             piece.v = lookup[1]
             piece.area = span * wp.abs(wp.dot(hit.normal, decal.ahead)) / decal.area
             piece.light = gain * (remaining * lookup[2])
-            keep(out, piece)
+            list_fragment(out, piece)
             remaining = remaining * (1.0 - lookup[2])
     if wearable == 1:
         count = all.start[draw + 1] - all.start[draw]
@@ -429,14 +429,14 @@ def wear(
                 piece.v = lookup[1]
                 piece.area = hit.stretch / ((layer.box[2] - layer.box[0]) * (layer.box[3] - layer.box[1])) * span
                 piece.light = gain * (remaining * lookup[2])
-                keep(out, piece)
+                list_fragment(out, piece)
                 remaining = remaining * (1.0 - lookup[2])
 
 
 @wp.func
 def shade_pixel(
     geometry: Geometry,
-    draw_samples: Drawn,
+    draw_samples: DrawRanges,
     layers: Layers,
     focal: wp.vec4,
     pose: wp.mat44,
@@ -517,18 +517,20 @@ def shade_pixel(
                     albedo = draw_samples.paints[hit.draw]
                 albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
                 if layers.any == 1:
-                    albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, surface_tag)
+                    albedo = albedo * remaining_own_colour(
+                        layers, view, hit.draw, geometry.wearable[hit.face], hit, surface_tag
+                    )
                 row = cell_of(hit.place, eye)
                 open_ = float(1.0)
                 if row >= 0:
                     row = view * CELLS * CELLS + row
                     if hit.normal[2] > 0.7:
                         open_ = openness(near, row, hit.place)
-                lit = lit_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
+                lit = light_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
                 glow = surface.emission + surface.night * light.lamps
                 if surface.lamp == 1 and draw_samples.lit[hit.draw] == 0:
                     glow = 0.0
-                shaded = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
+                shaded = reflected_light(light, near, row, surface, albedo, glow, hit, lit, away)
                 colour = shaded.colour
                 share = float(covered) / float(count)
                 if layers.any == 1 or (projecting == 1 and row >= 0):
@@ -540,7 +542,7 @@ def shade_pixel(
                     span = span / (wp.length(ray) * wp.dot(ray, ray))
                     gain = shaded.gain * share
                     if layers.any == 1:
-                        wear(
+                        list_layer_fragments(
                             out,
                             layers,
                             view,
@@ -573,7 +575,7 @@ def shade_pixel(
 @wp.kernel(cuda_max_registers=REGISTERS)
 def shade(
     geometry: Geometry,
-    draw_samples: Drawn,
+    draw_samples: DrawRanges,
     layers: Layers,
     lens: wp.array(dtype=wp.vec4),
     to_world: wp.array(dtype=wp.mat44),

@@ -10,11 +10,11 @@ from ssad.core.types import EpisodeAgent, Phase, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import SPEED_SPREAD, Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._meeting import meeting_place
 from ssad.scenarios.dynamic.knowledge._placing import (
-    ahead,
     bending_route,
+    move_pose,
+    place_ahead,
     pose_at,
-    scripted,
-    shifted,
+    scripted_agent,
 )
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ ONCOMING = math.pi
 _BODY = "coupe"
 
 
-def box(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
+def junction_parameters(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
     """Return the parameters of a car that meets the ego in a junction, each 5 around SafeBench's value.
 
     Args:
@@ -91,8 +91,8 @@ def meeting_car(
     """
     values = kind.values(scenario.parameters)
     if scenario.placements:
-        pose = shifted(scenario.placements[0], values["longitudinal"], 0.0)
-        return [scripted(name, _BODY, pose, phases)]
+        pose = move_pose(scenario.placements[0], values["longitudinal"], 0.0)
+        return [scripted_agent(name, _BODY, pose, phases)]
     start_place = meeting_place(
         graph,
         scenario,
@@ -102,5 +102,5 @@ def meeting_car(
         speed=kind.box["speed"].default,
         body=_BODY,
     )
-    start_place = ahead(graph, start_place, values["longitudinal"])
-    return [scripted(name, _BODY, pose_at(graph, start_place), phases, bending_route(graph, start_place))]
+    start_place = place_ahead(graph, start_place, values["longitudinal"])
+    return [scripted_agent(name, _BODY, pose_at(graph, start_place), phases, bending_route(graph, start_place))]

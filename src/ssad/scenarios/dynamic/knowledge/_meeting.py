@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import F64, LaneType, Route, Scenario
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._placing import (
     LanePosition,
     junction_span,
@@ -18,7 +19,6 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     pose_at,
     turn_of,
 )
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def meeting_place(
     return start_position
 
 
-@remembered()
+@cached_by_identity()
 def _search(  # noqa: PLR0917  a remembered function takes its arguments by position
     graph: LaneGraph,
     route: Route,
@@ -122,9 +122,9 @@ def _search(  # noqa: PLR0917  a remembered function takes its arguments by posi
             if approach_lane in ego_lanes or abs(turn_of(graph, inside_lane)) > math.radians(35):
                 continue
             approach = pose_at(graph, LanePosition(approach_lane, float(graph.length[approach_lane])))
-            if abs(wrap(approach.yaw - heading - side)) > math.radians(40):
+            if abs(wrap_scalar(approach.yaw - heading - side)) > math.radians(40):
                 continue
-            candidate = _meet(
+            candidate = _best_start(
                 graph,
                 route,
                 span=span,
@@ -140,7 +140,7 @@ def _search(  # noqa: PLR0917  a remembered function takes its arguments by posi
     return None
 
 
-def _meet(
+def _best_start(
     graph: LaneGraph,
     route: Route,
     *,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import F64, Controller, EpisodeAgent, LaneType, Phase, PhaseTrigger, Pose, Route, Scenario
-from ssad.scenarios.dynamic.knowledge._remember import remembered
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -32,10 +32,12 @@ class LanePosition:
     s: float
 
 
-def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
+def move_pose(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
     """Move a pose in its own frame, then turn it."""
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
-    return Pose(pose.x + cosine * forward - sine * left, pose.y + sine * forward + cosine * left, wrap(pose.yaw + turn))
+    return Pose(
+        pose.x + cosine * forward - sine * left, pose.y + sine * forward + cosine * left, wrap_scalar(pose.yaw + turn)
+    )
 
 
 # ---------------------------------------------------------------- lanes
@@ -44,7 +46,7 @@ def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
 def pose_at(graph: LaneGraph, place: LanePosition) -> Pose:
     """Return the pose on the centre line, heading along traffic; clamped to the lane's ends."""
     x, y, yaw, _ = graph.at(place.lane, place.s)
-    return Pose(x, y, wrap(yaw))
+    return Pose(x, y, wrap_scalar(yaw))
 
 
 def width_at(graph: LaneGraph, place: LanePosition) -> float:
@@ -70,7 +72,7 @@ def project(graph: LaneGraph, lane: int, x: float, y: float) -> LanePosition:
     )
 
 
-def beside(graph: LaneGraph, place: LanePosition, side: str) -> LanePosition | None:
+def adjacent_place(graph: LaneGraph, place: LanePosition, side: str) -> LanePosition | None:
     """Return the same position on the lane to the left or right in driving direction, None without one."""
     neighbour = int((graph.left if side == "left" else graph.right)[place.lane])
     if neighbour < 0:
@@ -86,8 +88,8 @@ def turn_of(graph: LaneGraph, lane: int) -> float:
     return float(yaw[-1] - yaw[0])
 
 
-@remembered(1 << 14)
-def straightest(graph: LaneGraph, lane: int) -> int | None:
+@cached_by_identity(1 << 14)
+def straightest_successor(graph: LaneGraph, lane: int) -> int | None:
     """Return the driving successor that turns least, None at the end of the road."""
     successors = [
         int(successor) for successor in graph.successors(lane) if graph.kind[successor] == LaneType.DRIVING
@@ -95,11 +97,13 @@ def straightest(graph: LaneGraph, lane: int) -> int | None:
     return min(successors, key=lambda successor: (abs(turn_of(graph, successor)), successor), default=None)
 
 
-def ahead(graph: LaneGraph, place: LanePosition, distance: float, *, stop_at_junction: bool = False) -> LanePosition:
+def place_ahead(
+    graph: LaneGraph, place: LanePosition, distance: float, *, stop_at_junction: bool = False
+) -> LanePosition:
     """Return the position `distance` m further on, straight on at forks; clamped to the end of the road."""
     lane, arc_length = place.lane, place.s + distance
     while arc_length > float(graph.length[lane]):
-        successor = straightest(graph, lane)
+        successor = straightest_successor(graph, lane)
         if successor is None or (stop_at_junction and graph.junction[lane] < 0 <= graph.junction[successor]):
             return LanePosition(lane, float(graph.length[lane]))
         arc_length -= float(graph.length[lane])
@@ -107,12 +111,14 @@ def ahead(graph: LaneGraph, place: LanePosition, distance: float, *, stop_at_jun
     return LanePosition(lane, arc_length)
 
 
-def behind(graph: LaneGraph, place: LanePosition, distance: float) -> LanePosition:
+def place_behind(graph: LaneGraph, place: LanePosition, distance: float) -> LanePosition:
     """Return the position `distance` m further back, straight on at forks; clamped to the start of the road."""
     lane, arc_length = place.lane, place.s - distance
     while arc_length < 0.0:
         predecessors = [
-            predecessor for predecessor in graph.predecessors(lane).tolist() if straightest(graph, predecessor) == lane
+            predecessor
+            for predecessor in graph.predecessors(lane).tolist()
+            if straightest_successor(graph, predecessor) == lane
         ]
         if not predecessors:
             return LanePosition(lane, 0.0)
@@ -131,7 +137,7 @@ def lane_path(graph: LaneGraph, place: LanePosition, distance: float) -> F64:
         # Successive lanes share their end point; the 5 cm margin drops the duplicate.
         parts.append(graph.xy[span][(arc_length > start + 0.05) & (arc_length <= start + remaining)].astype(np.float64))
         remaining -= float(arc_length[-1]) - start
-        successor = straightest(graph, lane)
+        successor = straightest_successor(graph, lane)
         if remaining <= 0.0 or successor is None:
             return np.concatenate(parts)
         lane, start = successor, 0.0
@@ -187,7 +193,7 @@ def trigger_index(scenario: Scenario, route: Route) -> int:
     return index
 
 
-@remembered()
+@cached_by_identity()
 def _nearest_point(route: Route, pose: Pose) -> tuple[int, float]:
     """Return the index of the route point nearest to a pose, and its distance."""
     distances = np.hypot(route.xy[:, 0] - pose.x, route.xy[:, 1] - pose.y)
@@ -202,7 +208,7 @@ def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) 
     return _lane_under(graph, route, index)
 
 
-@remembered()
+@cached_by_identity()
 def _lane_under(graph: LaneGraph, route: Route, index: int) -> LanePosition:
     """Return the lane position under a route point on the lane graph."""
     return project(graph, int(route.lane[index]), float(route.xy[index, 0]), float(route.xy[index, 1]))
@@ -229,10 +235,10 @@ def ahead_and_left(
         RouteError: There is no such lane.
     """
     reference = trigger_place(graph, scenario, route)
-    left_position = beside(graph, ahead(graph, reference, distance + gap), "left")
+    left_position = adjacent_place(graph, place_ahead(graph, reference, distance + gap), "left")
     if left_position is None:
         raise RouteError(f"scenario {scenario.name}: {scenario.type} needs a lane to the left of the ego's")
-    return ahead(graph, reference, distance), left_position
+    return place_ahead(graph, reference, distance), left_position
 
 
 def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[int, int]:
@@ -247,7 +253,7 @@ def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[i
     return span
 
 
-@remembered()
+@cached_by_identity()
 def _first_junction(graph: LaneGraph, route: Route, first: int) -> tuple[int, int] | None:
     """Return the route points at which the first junction from point `first` on begins and ends, or None."""
     in_junction = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
@@ -266,7 +272,7 @@ def to_outermost(graph: LaneGraph, place: LanePosition, *, kinds: Sequence[LaneT
     """
     crossed = 0
     while True:
-        right_position = beside(graph, place, "right")
+        right_position = adjacent_place(graph, place, "right")
         if right_position is None or graph.kind[right_position.lane] not in kinds:
             return place, crossed
         is_shoulder = graph.kind[right_position.lane] == LaneType.SHOULDER
@@ -280,12 +286,12 @@ def to_outermost(graph: LaneGraph, place: LanePosition, *, kinds: Sequence[LaneT
 # ---------------------------------------------------------------- agents
 
 
-def go(speed: float, trigger_distance: float) -> Phase:
+def make_drive_phase(speed: float, trigger_distance: float) -> Phase:
     """Return the phase that drives at `speed` once the ego is within `trigger_distance` m of actor 0."""
     return Phase(speed, PhaseTrigger("ego_distance", trigger_distance, 0))
 
 
-def go_when_ego_moves(speed: float, trigger_distance: float) -> tuple[Phase, ...]:
+def wait_and_drive_phases(speed: float, trigger_distance: float) -> tuple[Phase, ...]:
     """As `go`, but wait until the ego drives faster than 0.5 m/s."""
     return (
         Phase(0.0, PhaseTrigger("ego_distance", trigger_distance, 0)),
@@ -293,7 +299,9 @@ def go_when_ego_moves(speed: float, trigger_distance: float) -> tuple[Phase, ...
     )
 
 
-def scripted(name: str, body: str, pose: Pose, phases: Sequence[Phase], route: Route | None = None) -> EpisodeAgent:
+def scripted_agent(
+    name: str, body: str, pose: Pose, phases: Sequence[Phase], route: Route | None = None
+) -> EpisodeAgent:
     """Return an agent that stands until its first phase begins."""
     return EpisodeAgent(
         name=name,
@@ -306,6 +314,6 @@ def scripted(name: str, body: str, pose: Pose, phases: Sequence[Phase], route: R
     )
 
 
-def standing(name: str, body: str, pose: Pose) -> EpisodeAgent:
+def standing_agent(name: str, body: str, pose: Pose) -> EpisodeAgent:
     """Return an agent that never moves."""
     return EpisodeAgent(name=name, model=body, controller=Controller.NONE, pose=pose, target_speed=0.0)

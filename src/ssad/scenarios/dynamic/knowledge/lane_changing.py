@@ -11,7 +11,13 @@ import numpy as np
 
 from ssad.core.types import EpisodeAgent, Phase, PhaseTrigger, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import ahead_and_left, bending_route, go, pose_at, scripted
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead_and_left,
+    bending_route,
+    make_drive_phase,
+    pose_at,
+    scripted_agent,
+)
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -27,21 +33,21 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     leader_position, neighbour_position = ahead_and_left(
         graph, scenario, route, distance=values["distance"], gap=values["gap"]
     )
-    drive_phase = go(values["leader_speed"], values["trigger_distance"])
+    drive_phase = make_drive_phase(values["leader_speed"], values["trigger_distance"])
     brake_phase = Phase(values["brake_speed"], PhaseTrigger("travelled", values["brake_after"]))
     return [
-        scripted(
+        scripted_agent(
             "leader",
             "suv",
             pose_at(graph, leader_position),
             [drive_phase, brake_phase],
             bending_route(graph, leader_position),
         ),
-        scripted(
+        scripted_agent(
             "neighbour",
             "coupe",
             pose_at(graph, neighbour_position),
-            [go(values["neighbour_speed"], values["trigger_distance"])],
+            [make_drive_phase(values["neighbour_speed"], values["trigger_distance"])],
             bending_route(graph, neighbour_position),
         ),
     ]

@@ -30,7 +30,7 @@ def lanes_beside(graph: LaneGraph, lane: int) -> list[int]:
     sides: list[list[int]] = [[], []]
     for adjacent, side_lanes in zip((graph.left, graph.right), sides, strict=True):
         neighbour = int(adjacent[lane])
-        while neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour):
+        while neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.is_same_direction(lane, neighbour):
             side_lanes.append(neighbour)
             neighbour = int(adjacent[neighbour])
     return [*reversed(sides[0]), lane, *sides[1]]

@@ -26,9 +26,9 @@ from ssad.core.types import (
     SignalPlan,
     TrafficPlan,
 )
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, pose_at
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -69,8 +69,8 @@ def spawn_places(graph: LaneGraph) -> list[LanePosition]:
     return positions
 
 
-@remembered(64)
-def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[LanePosition, Pose], ...]:
+@cached_by_identity(64)
+def spawn_candidates(graph: LaneGraph, route: Route) -> tuple[tuple[LanePosition, Pose], ...]:
     """Return the spawn places that FREA's rules allow for a route.
 
     Args:
@@ -110,7 +110,7 @@ def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[LanePosition, Pose
     return tuple(accepted)
 
 
-def fits(model_name: str, route: Route) -> bool:
+def fits_route(model_name: str, route: Route) -> bool:
     """Return True if a vehicle takes a route's tightest bend without its nose swinging into the oncoming lane.
 
     At curvature k of its centre's path the body lags by the slip asin(k wheelbase / 2), so that its front
@@ -135,7 +135,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
 
     plan = scenario.traffic or TRAFFIC
     values = SCENARIO.values(scenario.parameters)
-    spawn_positions = candidates(graph, route)
+    spawn_positions = spawn_candidates(graph, route)
     count = min(max(int(len(spawn_positions) * plan.intensity), plan.minimum), plan.maximum)
     agents: list[EpisodeAgent] = []
     for index in rng.permutation(len(spawn_positions)):
@@ -146,7 +146,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
             continue
         model_name = mixed_body(rng)
         vehicle_route = random_route(graph, place.lane, place.s, _ROUTE, rng)
-        if not fits(model_name, vehicle_route):
+        if not fits_route(model_name, vehicle_route):
             model_name = "compact"
         speed = values["speed"] + values["speed_spread"] * float(rng.uniform(-1.0, 1.0))
         agents.append(

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import EpisodeAgent, LaneType, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
-    ahead,
-    go,
+    make_drive_phase,
+    move_pose,
+    place_ahead,
     pose_at,
-    scripted,
-    shifted,
-    standing,
+    scripted_agent,
+    standing_agent,
     to_outermost,
     trigger_place,
     width_at,
@@ -39,20 +39,22 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     reference = trigger_place(graph, scenario, route)
     outermost, crossed = to_outermost(graph, reference, kinds=_LANES)
     in_junction = bool(graph.junction[outermost.lane] >= 0)
-    kerb_position = ahead(
+    kerb_position = place_ahead(
         graph, outermost, values["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction
     )
-    kerb = shifted(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, reference))
-    walker = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
+    kerb = move_pose(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, reference))
+    walker = move_pose(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
     origin = pose_at(graph, reference)
     blocker = Pose(
         origin.x + _BLOCKER * (walker.x - origin.x),
         origin.y + _BLOCKER * (walker.y - origin.y),
-        wrap(walker.yaw + math.pi),
+        wrap_scalar(walker.yaw + math.pi),
     )
     return [
-        scripted("walker", "walker", walker, [go(values["walker_speed"], values["trigger_distance"])]),
-        standing("vending machine", "vending_machine", blocker),
+        scripted_agent(
+            "walker", "walker", walker, [make_drive_phase(values["walker_speed"], values["trigger_distance"])]
+        ),
+        standing_agent("vending machine", "vending_machine", blocker),
     ]
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from ssad.core.types import EpisodeAgent, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
-    ahead,
-    go,
     junction_span,
+    make_drive_phase,
+    move_pose,
+    place_ahead,
     pose_at,
     route_place,
-    scripted,
-    shifted,
+    scripted_agent,
     to_outermost,
     width_at,
 )
@@ -34,12 +34,14 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     """Place a cyclist (actor 0) beside the exit road, facing it."""
     values = SCENARIO.values(scenario.parameters)
     _, exit_index = junction_span(graph, scenario, route)
-    exit_position = ahead(graph, route_place(graph, scenario, route, exit_index), values["exit_distance"])
+    exit_position = place_ahead(graph, route_place(graph, scenario, route, exit_index), values["exit_distance"])
     outermost, crossed = to_outermost(graph, exit_position, kinds=(LaneType.DRIVING, LaneType.PARKING))
-    kerb_position = ahead(graph, outermost, _PER_LANE * crossed + values["longitudinal"])
-    kerb = shifted(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, kerb_position))
-    cyclist = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
-    return [scripted("cyclist", "bicycle", cyclist, [go(values["speed"], values["trigger_distance"])])]
+    kerb_position = place_ahead(graph, outermost, _PER_LANE * crossed + values["longitudinal"])
+    kerb = move_pose(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, kerb_position))
+    cyclist = move_pose(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
+    return [
+        scripted_agent("cyclist", "bicycle", cyclist, [make_drive_phase(values["speed"], values["trigger_distance"])])
+    ]
 
 
 SCENARIO = ScenarioType(

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.types import EpisodeAgent, Route, Scenario, SignalPlan
-from ssad.scenarios.dynamic.knowledge._junction import ONCOMING, box, meeting_car
+from ssad.scenarios.dynamic.knowledge._junction import ONCOMING, junction_parameters, meeting_car
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import go
+from ssad.scenarios.dynamic.knowledge._placing import make_drive_phase
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Place a car (actor 0) on the opposite approach; it goes straight on."""
     values = SCENARIO.values(scenario.parameters)
-    phases = [go(values["speed"], values["trigger_distance"])]
+    phases = [make_drive_phase(values["speed"], values["trigger_distance"])]
     return meeting_car(SCENARIO, scenario, graph, route, name="oncoming car", sides=(ONCOMING,), phases=phases)
 
 
@@ -30,7 +30,7 @@ SCENARIO = ScenarioType(
     title="Unprotected Left-turn",
     nhtsa="The ego turns left at green across the path of an oncoming car that has green too.",
     build=build,
-    parameters=box(speed=12.0, trigger_distance=45.0),
+    parameters=junction_parameters(speed=12.0, trigger_distance=45.0),
     signals=SignalPlan(ego="green", others="green"),
     max_distance=150.0,
 )

@@ -11,7 +11,14 @@ import numpy as np
 
 from ssad.core.types import EpisodeAgent, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import ahead_and_left, bending_route, go, pose_at, scripted, standing
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead_and_left,
+    bending_route,
+    make_drive_phase,
+    pose_at,
+    scripted_agent,
+    standing_agent,
+)
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -24,12 +31,12 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         graph, scenario, route, distance=values["distance"], gap=values["gap"]
     )
     return [
-        standing("parked car", "compact", pose_at(graph, parked_place)),
-        scripted(
+        standing_agent("parked car", "compact", pose_at(graph, parked_place)),
+        scripted_agent(
             "oncoming car",
             "compact",
             pose_at(graph, oncoming_place),
-            [go(values["speed"], values["trigger_distance"])],
+            [make_drive_phase(values["speed"], values["trigger_distance"])],
             bending_route(graph, oncoming_place),
         ),
     ]

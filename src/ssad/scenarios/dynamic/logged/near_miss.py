@@ -18,9 +18,9 @@ from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.geometry import obb_distance
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.criticality import boxes
-from ssad.scenarios.dynamic.frozen import frozen, with_motion
-from ssad.scenarios.dynamic.transition.kinematics import King
+from ssad.metrics.criticality import trace_boxes
+from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
+from ssad.scenarios.dynamic.transition.king import King
 from ssad.scenarios.dynamic.transition.motion import MOVES, TimedPath
 
 LATEST: Final = 6.0  # s by which they missed each other at most
@@ -48,7 +48,7 @@ class NearMiss:
 
 def near_misses(trace: EpisodeTrace) -> list[NearMiss]:
     """Return the closest near miss of each moving vehicle, the smallest time difference first."""
-    agent_boxes, step = boxes(trace), STRIDE * float(trace.dt)
+    agent_boxes, step = trace_boxes(trace), STRIDE * float(trace.dt)
     rows = np.arange(0, len(trace.x), STRIDE)
     max_rows = round(LATEST / step)
     misses = []
@@ -87,7 +87,7 @@ class NearMisses:
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
         self.bases = list(bases)
-        self._frozen = [frozen(base.episode, base.trace) for base in bases]
+        self._frozen = [freeze_episode(base.episode, base.trace) for base in bases]
         self._misses = [near_misses(base.trace) for base in bases]
         self._random = [generator("near misses", seed) for seed in seeds]
         self._tried = [0] * len(self.bases)
@@ -119,18 +119,18 @@ class NearMisses:
         )
         shift, offset = random.standard_normal(2) if proposal_count >= len(misses) else (0.0, 0.0)
         name = base.trace.names[misses[miss_index].agent]
-        rows = moved(base.trace, misses[miss_index], shift=SHIFT * shift, aside=ASIDE * offset)
+        rows = perturb_motion(base.trace, misses[miss_index], shift=SHIFT * shift, lateral=ASIDE * offset)
         return Proposal(with_motion(self._frozen[k], name, rows), adversaries=(name,))
 
 
-def moved(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: float) -> F64:
+def perturb_motion(trace: EpisodeTrace, miss: NearMiss, *, shift: float, lateral: float) -> F64:
     """The motion [T, 4] of who was missed, scaled in time so that both are at the place at about the same time.
 
     Args:
         trace: The recorded drive.
         miss: The near miss.
         shift: s by which it then comes later than the ego.
-        aside: m to the left of where it drove.
+        lateral: m to the left of where it drove.
     """
     recorded_path = TimedPath.of(trace, miss.agent)
     start_time = float(recorded_path.time[0])
@@ -141,5 +141,5 @@ def moved(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: float) ->
     blend = np.clip((recorded_path.time - start_time) / 2.0, 0.0, 1.0)
     return recorded_path.rows(
         np.interp(warped_time, recorded_path.time, recorded_path.distance) + overshoot,
-        aside * blend * blend * (3.0 - 2.0 * blend),
+        lateral * blend * blend * (3.0 - 2.0 * blend),
     )

@@ -62,7 +62,7 @@ class Bayesian(BoxSearch):
         self._danger[index] = np.append(self._danger[index], np.maximum(danger, -20.0))
 
 
-def predict(x: F64, y: F64, at: F64) -> tuple[F64, F64]:
+def predict(x: F64, y: F64, query_points: F64) -> tuple[F64, F64]:
     """Mean and standard deviation [M] of the process at points [M, D], from values y [N] at x [N, D].
 
     The length scale is the likeliest of `LENGTHS`.
@@ -80,7 +80,7 @@ def predict(x: F64, y: F64, at: F64) -> tuple[F64, F64]:
             best_fit, best_likelihood = (length, factor, whitened), log_likelihood
     assert best_fit is not None
     length, factor, whitened = best_fit
-    cross = np.linalg.solve(factor, _matern(_distance(x, at) / length))
+    cross = np.linalg.solve(factor, _matern(_distance(x, query_points) / length))
     # Rounding can push the variance at an evaluated point below zero.
     deviation = np.sqrt(np.maximum(1.0 - (cross**2).sum(0), 1e-12))
     return centre + scale * (cross.T @ whitened), scale * deviation

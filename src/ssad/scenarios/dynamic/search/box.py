@@ -13,12 +13,12 @@ import numpy.typing as npt
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import F64, Episode, Scenario
-from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.catalogue import scenario_type
 from ssad.scenarios.dynamic.sampling import TARGET_SPEED
 
 
 @dataclasses.dataclass(frozen=True)
-class Box:
+class ParameterBox:
     """Search space of a scenario: the parameters of its class over their full ranges.
 
     The ego's start and target speed are fixed: a generator chooses what other agents do.
@@ -32,7 +32,7 @@ class Box:
     ranges: dict[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Box:
+    def of(cls, scenario: Scenario) -> ParameterBox:
         """Return the box of a scenario.
 
         Raises:
@@ -64,7 +64,7 @@ class Box:
         )
         return shares.clip(0.0, 1.0)
 
-    def at(self, point: npt.ArrayLike) -> Scenario:
+    def scenario_at(self, point: npt.ArrayLike) -> Scenario:
         """Return the scenario at a point of the unit cube; coordinates outside are clipped."""
         shares = np.clip(np.asarray(point, np.float64), 0.0, 1.0).tolist()
         values = {
@@ -81,7 +81,7 @@ class BoxSearch(ABC):
     name: ClassVar[str]
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        self.boxes = [Box.of(base.scenario) for base in bases]
+        self.boxes = [ParameterBox.of(base.scenario) for base in bases]
         self.budget = budget
         self.seeds = list(seeds)
         self._last_points: list[F64] = []
@@ -93,7 +93,7 @@ class BoxSearch(ABC):
         Raises:
             ConfigError: It has none.
         """
-        Box.of(episode.scenario)
+        ParameterBox.of(episode.scenario)
 
     @abstractmethod
     def points(self, index: int, count: int) -> F64:
@@ -106,7 +106,7 @@ class BoxSearch(ABC):
         """Return the scenarios at the next points of each base."""
         self._last_points = [self.points(base_index, count) for base_index in range(len(self.boxes))]
         return [
-            [Proposal(box.at(point)) for point in points]
+            [Proposal(box.scenario_at(point)) for point in points]
             for box, points in zip(self.boxes, self._last_points, strict=True)
         ]
 

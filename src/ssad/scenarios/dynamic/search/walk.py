@@ -55,7 +55,7 @@ class _LocalSearch(BoxSearch):
         """Return the points [1 to count, D] to try next around the current point of a base."""
 
     @abstractmethod
-    def stuck(self, index: int) -> bool:
+    def is_stuck(self, index: int) -> bool:
         """Return True if the search of a base, which has just made no progress, should restart."""
 
     def points(self, index: int, count: int) -> F64:
@@ -73,7 +73,7 @@ class _LocalSearch(BoxSearch):
             state.point, state.danger, state.idle = points[worst_index], float(danger[worst_index]), 0
         else:
             state.idle += 1
-        if state.danger >= 0.0 or (state.idle and self.stuck(index)):
+        if state.danger >= 0.0 or (state.idle and self.is_stuck(index)):
             self._states[index] = self._begin(index, np.asarray(self._random[index].random(points.shape[1])))
 
     def _begin(self, index: int, point: F64) -> _SearchState:
@@ -94,7 +94,7 @@ class RandomWalk(_LocalSearch):
         point = self._states[index].point
         return np.asarray(np.clip(point + NEAR * self._random[index].standard_normal((count, len(point))), 0.0, 1.0))
 
-    def stuck(self, index: int) -> bool:
+    def is_stuck(self, index: int) -> bool:
         """Return True after three rounds without progress."""
         return self._states[index].idle >= PATIENCE
 
@@ -115,7 +115,7 @@ class ForwardBackward(_LocalSearch):
             state.axis = (state.axis + 1) % direction_count
         return np.asarray(candidates)
 
-    def stuck(self, index: int) -> bool:
+    def is_stuck(self, index: int) -> bool:
         """Return True once steps are short; until then halve them after each round through all parameters."""
         state = self._states[index]
         # A round tries up to 8 points, and a full turn has two per parameter.

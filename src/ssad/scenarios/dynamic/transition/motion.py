@@ -18,8 +18,8 @@ import numpy as np
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import seed32
 from ssad.core.types import F64, EpisodeTrace
-from ssad.scenarios.dynamic.frozen import frozen, with_motion
-from ssad.scenarios.dynamic.transition.kinematics import King, adversaries
+from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
+from ssad.scenarios.dynamic.transition.king import King, adversary_candidates
 
 KNOTS: Final = 8
 POPULATION: Final = 8
@@ -61,12 +61,12 @@ class TimedPath:
         """Speed along the path [T], m/s."""
         return np.asarray(np.gradient(self.distance, self.step))
 
-    def rows(self, distance: F64, aside: F64 | float = 0.0) -> F64:
+    def rows(self, distance: F64, lateral: F64 | float = 0.0) -> F64:
         """Return time, x, y and yaw [T, 4] at other distances along the path, with lateral offsets.
 
         Args:
             distance: [T] m along the path, non-decreasing; extrapolated straight beyond its end.
-            aside: [T] m to the left of the path.
+            lateral: [T] m to the left of the path.
         """
         path_distance, last_pose = self.distance, self.path[-1]
         # np.interp needs increasing abscissas; a standing vehicle repeats its distance.
@@ -76,16 +76,16 @@ class TimedPath:
         )
         overshoot = np.maximum(distance - path_distance[-1], 0.0)
         x, y = x + overshoot * np.cos(last_pose[2]), y + overshoot * np.sin(last_pose[2])
-        offset = np.broadcast_to(np.asarray(aside, np.float64), distance.shape)
+        offset = np.broadcast_to(np.asarray(lateral, np.float64), distance.shape)
         x, y = x - offset * np.sin(yaw), y + offset * np.cos(yaw)
         step_ahead = np.maximum(np.gradient(distance), 0.02)  # a standing vehicle does not turn
         turn = np.arctan2(np.gradient(offset), step_ahead)
         return np.stack([self.time, x, y, yaw + turn], 1)
 
 
-def movers(base: Base) -> list[int]:
+def moving_candidates(base: Base) -> list[int]:
     """Return the candidates for the adversary that move, or all candidates if none does."""
-    candidates = adversaries(base)
+    candidates = adversary_candidates(base)
     trace = base.trace
     moving = [agent for agent in candidates if np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent])) > MOVES]
     return moving or candidates
@@ -101,8 +101,8 @@ class MotionSearch(ABC):
         from cmaes import CMA
 
         self.bases = list(bases)
-        self._frozen = [frozen(base.episode, base.trace) for base in bases]
-        self._agents = [movers(base) for base in bases]
+        self._frozen = [freeze_episode(base.episode, base.trace) for base in bases]
+        self._agents = [moving_candidates(base) for base in bases]
         self._ways = [
             {candidate: TimedPath.of(base.trace, candidate) for candidate in candidates}
             for base, candidates in zip(bases, self._agents, strict=True)

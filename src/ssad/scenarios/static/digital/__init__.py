@@ -21,7 +21,7 @@ ATTACKS: dict[str, str] = {
     "pgd": f"{_HERE}.pgd:PGD",
     "cw": f"{_HERE}.cw:cw",
     "momentum": f"{_HERE}.momentum:momentum",
-    "apgd": f"{_HERE}.apgd:APGD",
+    "apgd": f"{_HERE}.apgd:apgd",
     "cw-min": f"{_HERE}.cw:MinimalCW",
     "square": f"{_HERE}.square:Square",
     "nes": f"{_HERE}.nes:NES",

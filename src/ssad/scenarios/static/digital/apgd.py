@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ class APGD:
     """Auto-PGD.
 
     Its first steps are twice the radius, and each checkpoint at most halves them. With few steps they are still long
-    at the end, and `PGD` is stronger; it warns of fewer than `MIN_STEPS`.
+    at the end, and `PGD` is stronger; `apgd` warns of fewer than `MIN_STEPS`.
 
     Attributes:
         steps: Gradient steps of each start, including the first gradient.
@@ -51,13 +52,6 @@ class APGD:
     def __post_init__(self) -> None:
         if self.steps < 2 or self.restarts < 0:
             raise ConfigError("apgd: steps must be 2 or more, restarts 0 or more")
-        if self.steps < MIN_STEPS:
-            warnings.warn(
-                f"apgd: {self.steps} steps are too few for its long first steps, so pgd with as many is stronger; take "
-                f"{MIN_STEPS} or more, or pgd",
-                UserWarning,
-                stacklevel=1,  # one place, so that Python shows it once
-            )
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """Run the ascent from every start and keep the best images."""
@@ -106,6 +100,34 @@ class APGD:
                 rise_count = torch.zeros_like(rise_count)
                 last_checkpoint = iteration
         return best_images, best_loss
+
+
+def apgd(*, steps: int = MIN_STEPS, start: Start = "uniform", restarts: int = 0) -> APGD:
+    """Return Auto-PGD, and warn of fewer steps than it needs beside `PGD`.
+
+    Args:
+        steps: Gradient steps of each start, including the first gradient.
+        start: Position of the first start.
+        restarts: Further random starts.
+
+    Raises:
+        ConfigError: See `APGD`.
+    """
+    attack = APGD(steps, start, restarts)
+    if steps < MIN_STEPS:
+        _warn_of_few(steps)
+    return attack
+
+
+@cache
+def _warn_of_few(steps: int) -> None:
+    """Warn of too few steps, once: the attack of a suite is built many times."""
+    warnings.warn(
+        f"apgd: {steps} steps are too few for its long first steps, so pgd with as many is stronger; take "
+        f"{MIN_STEPS} or more, or pgd",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 def checkpoints(steps: int) -> frozenset[int]:

@@ -46,7 +46,7 @@ def reference_attacks(gradients: int) -> tuple[Attack, ...]:
     """
     members: list[Attack] = [PGD(gradients), Square(queries=QUERIES_PER_GRADIENT * gradients)]
     if gradients > 1:
-        members.insert(1, APGD(gradients))
+        members.insert(1, APGD(gradients))  # few steps weaken this member alone: the strongest one is the reference
     return tuple(members)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.eval_mode import evaluating
+from ssad.core.eval_mode import in_eval_mode
 from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
 from ssad.scenarios.static.digital.budget import LEVELS, codes_of
@@ -205,7 +205,7 @@ def steady(detector: Any) -> Iterator[None]:
     try:
         with ExitStack() as stack:
             for module in roots:
-                stack.enter_context(evaluating(module))
+                stack.enter_context(in_eval_mode(module))
             yield
     finally:
         for parameter, requires_grad, gradient in flags:

@@ -84,16 +84,16 @@ class CameraFault:
         return faulty_frames
 
     def _frozen(self, state: _SceneState, time: float, frame: U8, random: np.random.Generator) -> U8:
-        if not state.faulty(time) or not state.images:
+        if not state.is_faulty(time) or not state.images:
             state.images = [frame.copy()]
         frozen_frame: U8 = state.images[0]
         return frozen_frame
 
     def _dropped(self, state: _SceneState, time: float, frame: U8, random: np.random.Generator) -> U8:
-        return np.zeros_like(frame) if state.faulty(time) else frame
+        return np.zeros_like(frame) if state.is_faulty(time) else frame
 
     def _blackout(self, state: _SceneState, time: float, frame: U8, random: np.random.Generator) -> U8:
-        return random.integers(0, 6, frame.shape, np.uint8) if state.faulty(time) and frame.any() else frame
+        return random.integers(0, 6, frame.shape, np.uint8) if state.is_faulty(time) and frame.any() else frame
 
     def _delayed(self, state: _SceneState, time: float, frame: U8, random: np.random.Generator) -> U8:
         state.images.append(frame.copy())
@@ -131,7 +131,7 @@ class _SceneState:
         self.images: list[U8] = []
         self.mask: F32 | None = None
 
-    def faulty(self, time: float) -> bool:
+    def is_faulty(self, time: float) -> bool:
         """Advance the schedule to a time and return the state of the fault."""
         while time >= self.until:
             self.state = not self.state

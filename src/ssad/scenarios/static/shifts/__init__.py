@@ -14,7 +14,7 @@ from ssad.scenarios.static.shifts.spec import (
     VERSIONS,
     Calibration,
     ShiftSpec,
-    dealt_severities,
+    deal_severities,
     random_severity,
 )
 
@@ -26,7 +26,7 @@ __all__ = [
     "VERSIONS",
     "Calibration",
     "ShiftSpec",
-    "dealt_severities",
+    "deal_severities",
     "random_severity",
     "shift_images",
     "shift_points",

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import quaternion_to_yaw, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Bool
@@ -61,7 +61,7 @@ def place_objects(spec: ShiftSpec, scene: str, poses: F64, boxes: Sequence[Track
     driven_length = stations[-2]
     piece_count = max(1, round((driven_length + table.ANOMALY_AHEAD) / table.ANOMALY_EVERY))
     piece_length = (driven_length + table.ANOMALY_AHEAD) / piece_count
-    occupied_parts = [_swept_ground(candidate) for candidate in boxes if len(candidate)]
+    occupied_parts = [_swept_rectangles(candidate) for candidate in boxes if len(candidate)]
     ego_centres = poses[:, :2, 3] + EGO[2] * poses[:, :2, 0]
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     ego_size = np.broadcast_to(EGO[:2], (len(poses), 2))
@@ -125,7 +125,7 @@ def _rectangles(centre: F64, yaw: F64, size: F64) -> F64:
     return np.asarray(corners + left * (corner_signs[:, 1] * size[:, 1:])[..., None])
 
 
-def _swept_ground(boxes: TrackedBoxes) -> F64:
+def _swept_rectangles(boxes: TrackedBoxes) -> F64:
     """Return the ground [N, 4, 2] under boxes, extended by their motion between samples."""
     speed = np.nan_to_num(np.linalg.norm(boxes.velocity[:, :2], axis=1))
     size = boxes.size_lwh[:, :2] + np.stack([MOVES * speed, np.zeros(len(boxes))], 1)
@@ -220,7 +220,7 @@ def add_anomalies(
     frames: Sequence[Frame],
     specs: Sequence[ShiftSpec],
     contexts: Mapping[str, SceneContext] | None,
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply anomalies, in both calibrations."""
     pixels, records = batch.numpy().copy(), []
     for index, (frame, spec) in enumerate(zip(frames, specs, strict=True)):
@@ -239,7 +239,7 @@ def _objects_in_frame(
     return [standing_object for standing_object in objects if standing_object.level <= spec.severity]
 
 
-def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
+def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> ShiftReport:
     """Draw objects into an image [H, W, 3], the farthest first, and record the visible ones."""
     camera_pose = camera_to_world(frame)
     canvas = _Canvas(image, frame)
@@ -260,7 +260,7 @@ def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied
             )
     coverage = canvas.finish(image)
     details = {"objects": records, "covered": coverage, "depth": "boxes" if frame.depth is None else "given"}
-    return Applied(bool(records), details)
+    return ShiftReport(bool(records), details)
 
 
 class _Canvas:
@@ -450,7 +450,7 @@ class _Canvas:
 
 def hit_by_rays(
     cloud: F32, frame: SweepFrame, spec: ShiftSpec, contexts: Mapping[str, SceneContext] | None
-) -> tuple[F32, Applied]:
+) -> tuple[F32, ShiftReport]:
     """Move the points [P, 5] behind an object to the hits of their rays.
 
     A ray without a return is not in the cloud, so an object before the sky gets no points.
@@ -477,7 +477,7 @@ def hit_by_rays(
     is_hit = hit_shares < 1.0
     cloud[is_hit, :3] *= hit_shares[is_hit, None].astype(np.float32)
     cloud[is_hit, 3] = intensities[is_hit]
-    return cloud, Applied(bool(is_hit.any()), {"moved": int(is_hit.sum())})
+    return cloud, ShiftReport(bool(is_hit.any()), {"moved": int(is_hit.sum())})
 
 
 @lru_cache(maxsize=64)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, camera_to_world
 from ssad.core.types import F32, U8
 from ssad.scenarios.static.shifts.batch import Batch, check_batch, like_input, to_batch
 from ssad.scenarios.static.shifts.exposure import overexpose
@@ -28,7 +28,7 @@ def shift_images(
     *,
     contexts: Mapping[str, SceneContext] | None = None,
     device: str | None = None,
-) -> tuple[Any, list[Applied]]:
+) -> tuple[Any, list[ShiftReport]]:
     """Apply a shift to images.
 
     The result for an image depends only on its frame and spec, never on the rest of the batch.
@@ -62,16 +62,16 @@ def shift_images(
         raise ConfigError("a batch has one shift and one calibration; severities and seeds may differ")
     shifted_indices = [index for index, image_spec in enumerate(specs) if image_spec.severity > 0]
     if not shifted_indices:
-        return images, [Applied(True, {"severity": 0}) for _ in specs]
+        return images, [ShiftReport(True, {"severity": 0}) for _ in specs]
     if len(shifted_indices) < batch.count:
-        return _shift_some(
+        return _shift_selected(
             images, batch, frames=list(frames), specs=specs, shifted_indices=shifted_indices, contexts=contexts
         )
     result, records = _dispatch(batch, frames, specs, contexts)
     return like_input(result, images), records
 
 
-def _shift_some(
+def _shift_selected(
     images: Any,
     batch: Batch,
     *,
@@ -79,7 +79,7 @@ def _shift_some(
     specs: list[ShiftSpec],
     shifted_indices: list[int],
     contexts: Mapping[str, SceneContext] | None,
-) -> tuple[Any, list[Applied]]:
+) -> tuple[Any, list[ShiftReport]]:
     """Shift the images of severity 1 or more; those of severity 0 stay unchanged."""
     pixels = batch.numpy().copy()
     shifted_pixels, records = shift_images(
@@ -90,7 +90,7 @@ def _shift_some(
         device=batch.device,
     )
     pixels[shifted_indices] = shifted_pixels
-    all_records = [Applied(True, {"severity": 0})] * batch.count
+    all_records = [ShiftReport(True, {"severity": 0})] * batch.count
     for index, record in zip(shifted_indices, records, strict=True):
         all_records[index] = record
     return like_input(to_batch(pixels, batch.device), images), all_records
@@ -101,7 +101,7 @@ def _dispatch(
     frames: Sequence[Frame],
     specs: Sequence[ShiftSpec],
     contexts: Mapping[str, SceneContext] | None,
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     name, calibration = specs[0].name, specs[0].calibration
     if name == "impulse":
         return add_impulses(batch, frames, specs)
@@ -114,7 +114,7 @@ def _dispatch(
 
         return add_anomalies(batch, frames, specs, contexts)
     if calibration == "paper":
-        from ssad.scenarios.static.shifts.paper import paper_shift
+        from ssad.scenarios.static.shifts.paper_calibration import paper_shift
 
         if name in ("snow", "rain", "fog", "sunlight", "motion_blur"):
             return paper_shift(batch, frames, specs)
@@ -129,7 +129,7 @@ def _dispatch(
 def _context(batch: Batch, index: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
-    return SceneContext(frame.scene, sky_light([batch.picture(index)], [frame.depth]), viewing_direction(frame))
+    return SceneContext(frame.scene, sky_light([batch.image(index)], [frame.depth]), viewing_direction(frame))
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:

@@ -12,7 +12,7 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Frame
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
@@ -37,7 +37,7 @@ class Batch:
         """Bytes per image."""
         return self.height * self.width * 3
 
-    def like(self) -> Batch:
+    def empty_like(self) -> Batch:
         """Return another batch of the same shape with undefined values."""
         buffer = wp.empty(self.count * self.stride, dtype=wp.uint8, device=self.device)
         return Batch(buffer, self.count, self.height, self.width, self.image_width, self.device)
@@ -53,7 +53,7 @@ class Batch:
         view._keep = self.data  # the memory belongs to the bytes
         return view
 
-    def picture(self, index: int) -> U8:
+    def image(self, index: int) -> U8:
         """Return one image [H, W, 3] in main memory."""
         pixels = self.data[index * self.stride : (index + 1) * self.stride].numpy()
         return np.asarray(pixels.reshape(self.height, self.width, 3)[:, : self.image_width])
@@ -89,7 +89,7 @@ def to_batch(images: Any, device: str | None = None) -> Batch:
     """
     if isinstance(images, Batch):
         return images
-    quiet_warp()
+    start_warp_quietly()
     # Not imported: without torch loaded, no image can be a tensor, and shifts work without it.
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(images, torch.Tensor):

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied
+from ssad.core.frames import ShiftReport
 from ssad.core.types import U8
 from ssad.rendering.camera.sensor import BRIGHTEST, KNEE, SHOULDER
 from ssad.scenarios.static.shifts.batch import Batch, to_device
@@ -35,11 +35,11 @@ def exposure_table(stops: float) -> U8:
     return np.rint(to_codes(np.where(longer_exposure > KNEE, compressed, longer_exposure))).astype(np.uint8)
 
 
-def overexpose(batch: Batch, specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
+def overexpose(batch: Batch, specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Apply overexposure, in both calibrations."""
     stops = [OVEREXPOSURE[spec.severity - 1] for spec in specs]
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     tables = to_device(batch, np.stack([exposure_table(value) for value in stops]), wp.uint8)
     batch.launch(recode, thread_shape, [batch.words(), tables, word_count, chunk_size], result.words())
-    return result, [Applied(True, {"stops": value}) for value in stops]
+    return result, [ShiftReport(True, {"stops": value}) for value in stops]

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Applied, SceneContext, SweepFrame
+from ssad.core.frames import SceneContext, ShiftReport, SweepFrame
 from ssad.core.types import F32, F64, Bool
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.objects import affine, deformed
+from ssad.scenarios.static.shifts.objects import box_maps, deformed_box_maps
 from ssad.scenarios.static.shifts.spec import CAMERA_ONLY, ShiftSpec
 from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
@@ -26,7 +26,7 @@ _BETA_0 = 1e-6 / np.pi  # reflectivity constant of Hahner et al. 2021
 
 def shift_points(
     points: npt.ArrayLike, frame: SweepFrame, spec: ShiftSpec, *, contexts: Mapping[str, SceneContext] | None = None
-) -> tuple[F32, Applied]:
+) -> tuple[F32, ShiftReport]:
     """Apply a shift to the points of a sweep.
 
     Args:
@@ -45,9 +45,9 @@ def shift_points(
     if cloud.ndim != 2 or cloud.shape[1] < 4:
         raise ConfigError(f"points must be [P, 5] (x, y, z, intensity, ring), not {list(cloud.shape)}")
     if spec.severity == 0:
-        return cloud, Applied(True, {"severity": 0})
+        return cloud, ShiftReport(True, {"severity": 0})
     if spec.name in CAMERA_ONLY:
-        return cloud, Applied(False, {}, {"changes cameras alone": 1})
+        return cloud, ShiftReport(False, {}, {"changes cameras alone": 1})
     if spec.places_objects:
         from ssad.scenarios.static.shifts.anomaly import hit_by_rays
 
@@ -62,7 +62,7 @@ def shift_points(
     if spec.name == "sunlight":
         context = (contexts or {}).get(frame.scene, SceneContext(frame.scene))
         if context.light < NIGHT:
-            return cloud, Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1})
+            return cloud, ShiftReport(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1})
         return _add_sun_noise(cloud, frame, spec, context, draws)
     if spec.name == "fog":
         return _add_fog(cloud, spec, draws)
@@ -73,7 +73,7 @@ def _ranges(cloud: F32) -> F64:
     return np.asarray(np.maximum(np.linalg.norm(cloud[:, :3].astype(np.float64), axis=1), 1e-3))
 
 
-def _add_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, ShiftReport]:
     """Add range noise (paper: noise of each coordinate); for impulse noise, replace some ranges."""
     count, level_index = len(cloud), spec.severity - 1
     is_paper = spec.calibration == "paper"
@@ -87,7 +87,7 @@ def _add_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple
             cloud[struck_indices, :3] *= (draws.uniform(1.0, np.maximum(ranges, 1.5)) / ranges).astype(np.float32)[
                 :, None
             ]
-        return cloud, Applied(len(struck_indices) > 0, {"points": len(struck_indices)})
+        return cloud, ShiftReport(len(struck_indices) > 0, {"points": len(struck_indices)})
     level = table.LIDAR_NOISE[level_index]
     size = (count, 3) if is_paper else (count,)
     noise = draws.normal(0, level, size) if spec.name == "gaussian" else draws.uniform(-level, level, size)
@@ -95,7 +95,7 @@ def _add_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple
         cloud[:, :3] += noise.astype(np.float32)
     else:
         cloud[:, :3] *= (1 + noise / _ranges(cloud)).astype(np.float32)[:, None]
-    return cloud, Applied(count > 0, {"level_m": level})
+    return cloud, ShiftReport(count > 0, {"level_m": level})
 
 
 def is_inside_box(cloud: F32 | F64, matrix: F64, centre: F64) -> Bool:
@@ -104,15 +104,17 @@ def is_inside_box(cloud: F32 | F64, matrix: F64, centre: F64) -> Bool:
     return np.asarray((np.abs(local) <= 0.5).all(1))
 
 
-def _move_objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _move_objects(
+    cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Generator
+) -> tuple[F32, ShiftReport]:
     """Move the points in each box with it. Each point belongs to the first box that contains it."""
     boxes = frame.boxes
     if not len(boxes) or not len(cloud):
-        return cloud, Applied(False, {"objects": 0})
+        return cloud, ShiftReport(False, {"objects": 0})
     pose = frame.ego_to_world @ frame.to_ego
     world_to_sensor, sensor_position = pose[:3, :3].T, pose[:3, 3]
-    old_maps, old_centres = affine(boxes)
-    new_maps, new_centres = deformed(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
+    old_maps, old_centres = box_maps(boxes)
+    new_maps, new_centres = deformed_box_maps(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
     old_maps, new_maps = world_to_sensor @ old_maps, world_to_sensor @ new_maps
     old_centres, new_centres = (
         (old_centres - sensor_position) @ world_to_sensor.T,
@@ -140,7 +142,7 @@ def _move_objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.rand
             result[object_points, :3] = local @ new_maps[box_index].T + new_centres[box_index]
         moved_count, object_count = moved_count + len(object_points), object_count + 1
     skipped = {"it does not move or its velocity is unknown": still_count} if still_count else {}
-    return result, Applied(object_count > 0, {"objects": object_count, "points": moved_count}, skipped)
+    return result, ShiftReport(object_count > 0, {"objects": object_count, "points": moved_count}, skipped)
 
 
 def _streak(local: F64, velocity: F64, spec: ShiftSpec, draws: np.random.Generator) -> F32 | None:
@@ -157,7 +159,7 @@ def _streak(local: F64, velocity: F64, spec: ShiftSpec, draws: np.random.Generat
 
 def _add_sun_noise(
     cloud: F32, frame: SweepFrame, spec: ShiftSpec, context: SceneContext, draws: np.random.Generator
-) -> tuple[F32, Applied]:
+) -> tuple[F32, ShiftReport]:
     """Remove the points around the sun, where the receiver is blind, and replace some ranges by noise of 2 m."""
     level_index = spec.severity - 1
     sun_in_sensor = (frame.ego_to_world @ frame.to_ego)[:3, :3].T @ sun_direction(spec, context)
@@ -167,16 +169,16 @@ def _add_sun_noise(
     is_noisy = draws.random(len(cloud)) < table.LIDAR_SUN[level_index]
     noise = np.maximum(1 + draws.normal(0, 2.0, len(cloud)) / ranges, 0.2)
     cloud[is_noisy, :3] *= noise[is_noisy].astype(np.float32)[:, None]
-    return cloud[is_returned], Applied(
+    return cloud[is_returned], ShiftReport(
         True, {"lost": int((~is_returned).sum()), "noisy": int((is_noisy & is_returned).sum())}
     )
 
 
-def _add_paper_sun_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_paper_sun_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, ShiftReport]:
     """Add the published noise of 2 m to each coordinate of the published share of points; no sun is in the world."""
     struck_indices = draws.permutation(len(cloud))[: int(len(cloud) * table.LIDAR_SUN[spec.severity - 1])]
     cloud[struck_indices, :3] += draws.normal(0, 2.0, (len(struck_indices), 3)).astype(np.float32)
-    return cloud, Applied(len(struck_indices) > 0, {"lost": 0, "noisy": len(struck_indices)})
+    return cloud, ShiftReport(len(struck_indices) > 0, {"lost": 0, "noisy": len(struck_indices)})
 
 
 def fog_response(beta: float) -> tuple[F64, F64, F64]:
@@ -209,7 +211,7 @@ def fog_response(beta: float) -> tuple[F64, F64, F64]:
     return ranges, strongest, ranges[strongest_index]
 
 
-def _add_fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, ShiftReport]:
     """Attenuate echoes by exp(-2 beta R); a stronger echo of the fog replaces that of the target."""
     beta = extinction(spec)
     ranges = _ranges(cloud)
@@ -224,7 +226,7 @@ def _add_fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F
     cloud[is_fog_echo, :3] *= (np.minimum(echo_range, ranges) / ranges)[is_fog_echo].astype(np.float32)[:, None]
     cloud[:, 3] = np.where(is_fog_echo, np.minimum(fog_echo, 255), target_echo).astype(np.float32)
     is_returned = _detected(intensity, ranges, beta) | is_fog_echo
-    return cloud[is_returned], Applied(True, {"lost": int((~is_returned).sum()), "moved": int(is_fog_echo.sum())})
+    return cloud[is_returned], ShiftReport(True, {"lost": int((~is_returned).sum()), "moved": int(is_fog_echo.sum())})
 
 
 def _detected(intensity: F32, ranges: F64, beta: float) -> Bool:
@@ -234,7 +236,7 @@ def _detected(intensity: F32, ranges: F64, beta: float) -> Bool:
     return np.asarray(clear_echo * np.exp(-2 * beta * ranges) >= np.minimum(1.0 / FARTHEST**2, 0.5 * clear_echo))
 
 
-def _add_precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, ShiftReport]:
     """Attenuate echoes and replace some by nearby drops or flakes (Goodin et al. 2019)."""
     beta = extinction(spec)
     ranges = _ranges(cloud)
@@ -250,4 +252,4 @@ def _add_precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) 
     jitter = draws.normal(0, 0.02 * (1 - np.exp(-beta * ranges)), len(cloud))
     cloud[~is_particle, :3] *= (1 + jitter / ranges)[~is_particle].astype(np.float32)[:, None]
     is_returned = _detected(intensity, ranges, beta) | is_particle
-    return cloud[is_returned], Applied(True, {"lost": int((~is_returned).sum()), "moved": int(is_particle.sum())})
+    return cloud[is_returned], ShiftReport(True, {"lost": int((~is_returned).sum()), "moved": int(is_particle.sum())})

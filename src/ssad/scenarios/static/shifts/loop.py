@@ -11,7 +11,7 @@ from ssad.core.boxes import TrackedBoxes
 from ssad.core.frames import Frame, SceneContext
 from ssad.core.rotations import upright_pose, yaw_to_quaternion
 from ssad.core.types import F32, F64, I32, U8, Episode
-from ssad.rendering.onboard import OnboardCamera, Sight
+from ssad.rendering.onboard import AgentView, OnboardCamera
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images, sky_light
 from ssad.scenarios.static.shifts.anomaly import place_objects
 from ssad.world.models import MODELS
@@ -44,7 +44,7 @@ class ShiftedCamera:
         camera_model = self.camera.camera
         shifted_images = np.zeros((len(agents), camera_model.height, camera_model.width, 3), np.uint8)
         speed = simulator.state().speed
-        for batch, rendering in self.camera.shots(self.camera.onboard.sights(simulator, agents)):
+        for batch, rendering in self.camera.render_batches(self.camera.onboard.agent_views(simulator, agents)):
             images = rendering.image.numpy()  # type: ignore[attr-defined]
             depth = rendering.depth.numpy()  # type: ignore[attr-defined]
             scenes = [int(agents[agent_view.row, 0]) for agent_view in batch]
@@ -58,7 +58,7 @@ class ShiftedCamera:
         return np.moveaxis(shifted_images, -1, 1)
 
     def _shift_batch(
-        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+        self, sights: Sequence[AgentView], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
     ) -> U8:
         """Return the images [N, H, W, 3] under the shift."""
         self._measure_contexts(sights, frames, images, episodes)
@@ -71,14 +71,14 @@ class ShiftedCamera:
         """True if the shift uses the boxes of objects, which take time to build."""
         return self.spec.family == "object" or self.spec.places_objects
 
-    def _frame(self, sight: Sight, depth: Any, speed: F32, dt: float) -> Frame:
+    def _frame(self, sight: AgentView, depth: Any, speed: F32, dt: float) -> Frame:
         key, step = sight.appearance.key, sight.moment.step
         sample = f"{key}/{step}/{sight.agent}/{self.camera.camera.channel}"
         boxes, ego_velocity = boxes_of(sight, speed) if self._needs_boxes else (TrackedBoxes.empty(), np.zeros(3))
         return Frame(self.camera.camera, key, sample, step * dt, sight.pose, ego_velocity, boxes, depth=depth)
 
     def _measure_contexts(
-        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+        self, sights: Sequence[AgentView], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
     ) -> None:
         """Measure the constants of each drive on its first image."""
         for agent_view, frame, image, episode in zip(sights, frames, images, episodes, strict=True):
@@ -90,7 +90,7 @@ class ShiftedCamera:
                 self._contexts[frame.scene] = SceneContext(frame.scene, light, heading, objects=objects)
 
 
-class OwnShiftedCamera(ShiftedCamera):
+class UserShiftedCamera(ShiftedCamera):
     """Camera that agents carry, with its images under a shift of the user's own.
 
     Args:
@@ -108,13 +108,13 @@ class OwnShiftedCamera(ShiftedCamera):
         return True
 
     def _shift_batch(
-        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+        self, sights: Sequence[AgentView], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
     ) -> U8:
         """Return the images [N, H, W, 3] under the shift, each by itself: no result depends on the batch."""
         return np.stack([self.shift(image[None], [frame])[0] for image, frame in zip(images, frames, strict=True)])
 
 
-def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:
+def boxes_of(sight: AgentView, speed: F32) -> tuple[TrackedBoxes, F64]:
     """Return the boxes of all other agents, and the velocity [3] of the observing agent, m/s.
 
     Args:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ssad.core.frames import Applied, Frame
+from ssad.core.frames import Frame, ShiftReport
 from ssad.scenarios.static.shifts.batch import Batch, file_keys, keys_on, to_device
 from ssad.scenarios.static.shifts.kernels import noise as kernels
 from ssad.scenarios.static.shifts.parameters import GAUSSIAN, IMPULSE, STUCK, UNIFORM
@@ -40,21 +40,23 @@ def noise_table(name: str, severity: int, calibration: str) -> npt.NDArray[np.in
     return rounded.astype(np.int16)
 
 
-def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
+def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Add `uniform` or `gaussian` noise."""
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     keys = file_keys(batch, specs, frames, "noise")
     tables = np.stack([noise_table(spec.name, spec.severity, spec.calibration) for spec in specs])
     inputs = [batch.words(), keys, to_device(batch, tables, wp.int16), word_count, chunk_size]
     batch.launch(kernels.add_noise, thread_shape, inputs, result.words())
     levels = {"gaussian": GAUSSIAN, "uniform": UNIFORM}
-    return result, [Applied(True, {"level": levels[image_spec.name][image_spec.severity - 1]}) for image_spec in specs]
+    return result, [
+        ShiftReport(True, {"level": levels[image_spec.name][image_spec.severity - 1]}) for image_spec in specs
+    ]
 
 
-def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
+def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Add impulse noise; in the physical calibration a fifth of it is stuck at fixed sites of a camera."""
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     total_shares = [IMPULSE[spec.severity - 1] for spec in specs]
     stuck_shares = [
@@ -77,6 +79,6 @@ def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
     inputs = [batch.words(), keys, fixed_keys, *rates, word_count, chunk_size]
     batch.launch(kernels.add_impulses, thread_shape, inputs, result.words())
     return result, [
-        Applied(True, {"share": share_value, "stuck": stuck_value})
+        ShiftReport(True, {"share": share_value, "stuck": stuck_value})
         for share_value, stuck_value in zip(total_shares, stuck_shares, strict=True)
     ]

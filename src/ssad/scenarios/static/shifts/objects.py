@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Frame, camera_to_world
+from ssad.core.frames import Frame, ShiftReport, camera_to_world
 from ssad.core.nuscenes_names import VISIBILITY
 from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
@@ -75,13 +75,15 @@ def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: st
     return np.array(instance_deformations).reshape(-1, 3, 3)
 
 
-def affine(boxes: TrackedBoxes) -> tuple[F64, F64]:
+def box_maps(boxes: TrackedBoxes) -> tuple[F64, F64]:
     """Return the maps from the unit cube to each box in the world: matrices [N, 3, 3] and centres [N, 3]."""
     return boxes.axes() * boxes.size_lwh[:, None], boxes.centre
 
 
-def deformed(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> tuple[F64, F64]:
-    """Return the maps of `affine` after the shift.
+def deformed_box_maps(
+    spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False
+) -> tuple[F64, F64]:
+    """Return the maps of `box_maps` after the shift.
 
     The deformation is about the centre of the base; for the paper's cameras, about the centre.
     """
@@ -113,7 +115,7 @@ def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sampl
     """
     if spec.family != "object" or spec.name == "motion_blur" or spec.severity == 0 or not len(boxes):
         return boxes
-    matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
+    matrix, centre = deformed_box_maps(spec, boxes, scene=scene, sample=sample)
     direction = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
     rotation = boxes.axes()
     forward, lateral = (np.einsum("ni,ni->n", direction, rotation[:, :, axis]) for axis in (0, 1))
@@ -171,7 +173,7 @@ def _pixels(corners: F64, intrinsic: F64) -> F64:
     )
 
 
-def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Applied:
+def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> ShiftReport:
     """Plan the boxes of one image, the farthest first."""
     boxes, intrinsic = frame.boxes, frame.camera.intrinsic
     width, height = frame.camera.width, frame.camera.height
@@ -180,8 +182,8 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
     if len(boxes):
         pose = camera_to_world(frame)
         world_to_camera, camera_position = pose[:3, :3].T, pose[:3, 3]
-        old_maps, old_centres = affine(boxes)
-        new_maps, new_centres = deformed(spec, boxes, scene=frame.scene, sample=frame.sample)
+        old_maps, old_centres = box_maps(boxes)
+        new_maps, new_centres = deformed_box_maps(spec, boxes, scene=frame.scene, sample=frame.sample)
         old_maps, new_maps = world_to_camera @ old_maps, world_to_camera @ new_maps
         old_centres, new_centres = (
             (old_centres - camera_position) @ world_to_camera.T,
@@ -231,7 +233,7 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
                 size=(width, height),
             )
     plan.first.append(len(plan.items))
-    return Applied(painted_count > 0, {"objects": painted_count}, dict(skipped))
+    return ShiftReport(painted_count > 0, {"objects": painted_count}, dict(skipped))
 
 
 def _streaks(
@@ -325,7 +327,7 @@ def _stamp(batch: Batch, plan: _Plan) -> tuple[Any, Any, Any, Any]:
     return items, points, offsets, owner_ranks
 
 
-def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Any, list[Applied]]:
+def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Any, list[ShiftReport]]:
     """Return the rank of the nearest box at each pixel, int16 [B, H, W], 0 for none; boxes of the paper."""
     plan = _Plan()
     records = [
@@ -337,7 +339,7 @@ def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) ->
     return _stamp(batch, plan)[3], records
 
 
-def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
+def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Apply scale, shear or rotation, or the motion blur of the physical calibration."""
     plan = _Plan()
     records = [

@@ -126,7 +126,7 @@ class ImageShift(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class OwnShift(Perturbation):
+class UserShift(Perturbation):
     """Distribution shift by a class of the user's own (see `ImageShift`).
 
     Attributes:
@@ -165,7 +165,8 @@ class OwnShift(Perturbation):
 
         def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
             return [
-                self.shifted(shifter.read(frame)[None], [shifter.described(frame)], scene.seed)[0] for frame in frames
+                self.shifted(shifter.read(frame)[None], [shifter.describe_frame(frame)], scene.seed)[0]
+                for frame in frames
             ]
 
         return PerturbedScene(look)
@@ -175,7 +176,7 @@ class OwnShift(Perturbation):
         return with_cameras(suite, partial(_own_shifted_camera, shift=self, seed=seed))
 
 
-def _own_shifted_camera(onboard: Onboard, camera: Camera, *, shift: OwnShift, seed: int) -> Sensor:
-    from ssad.scenarios.static.shifts.loop import OwnShiftedCamera
+def _own_shifted_camera(onboard: Onboard, camera: Camera, *, shift: UserShift, seed: int) -> Sensor:
+    from ssad.scenarios.static.shifts.loop import UserShiftedCamera
 
-    return OwnShiftedCamera(onboard.camera(camera), partial(shift.shifted, seed=seed))
+    return UserShiftedCamera(onboard.camera(camera), partial(shift.shifted, seed=seed))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import FormatError
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.safeio import read_bytes
@@ -136,7 +136,7 @@ class SceneShifter:
             basis_fields["sun"] = self._sun(frame.sample_token)[0]
         return basis_fields
 
-    def outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
+    def is_outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
         """Return True if a frame made on this basis would now have a better one."""
         sample_order = {sample.token: index for index, sample in enumerate(self.scene.samples)}
         used_index = sample_order.get(str(basis["context"]), len(sample_order)) if "context" in basis else 0
@@ -281,7 +281,7 @@ class SceneShifter:
             return self._frame(frame, boxes)
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
 
-    def described(self, frame: SensorFrame) -> Frame:
+    def describe_frame(self, frame: SensorFrame) -> Frame:
         """Return the description of an image with all that is known of it: boxes, depth, LiDAR returns."""
         return self._frame(
             frame, boxes_of(self.scene.annotations_of(frame))[0], self._points(frame), self._depth(frame)
@@ -303,7 +303,7 @@ class SceneShifter:
 
     def images(
         self, frames: Sequence[SensorFrame], *, clean: Sequence[U8] | None = None, device: str | None = None
-    ) -> tuple[list[U8], list[Applied]]:
+    ) -> tuple[list[U8], list[ShiftReport]]:
         """Return the shifted images of camera frames of one size.
 
         Args:
@@ -328,7 +328,7 @@ class SceneShifter:
         shifted, reports = shift_images(np.stack(clean_images), views, specs, contexts=self._contexts, device=device)
         return list(shifted), reports
 
-    def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, Applied]:
+    def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, ShiftReport]:
         """Return one shifted image, and a report.
 
         Raises:
@@ -354,7 +354,7 @@ class SceneShifter:
         boxes = [boxes_of(self.scene.annotations(sample.token))[0] for sample in self.scene.samples]
         return place_objects(self.base, self.scene.record.token, poses.reshape(-1, 4, 4), boxes)
 
-    def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
+    def points(self, frame: SensorFrame) -> tuple[F32, ShiftReport]:
         """Return the shifted points [P, 5] of a LiDAR frame, and a report.
 
         Raises:
@@ -411,11 +411,11 @@ def _has_lens(frame: SensorFrame) -> bool:
 def _count_points(cloud: F32, sweep: SensorFrame, boxes: TrackedBoxes) -> npt.NDArray[np.int32]:
     """Count the points in each box."""
     from ssad.scenarios.static.shifts.lidar import is_inside_box
-    from ssad.scenarios.static.shifts.objects import affine
+    from ssad.scenarios.static.shifts.objects import box_maps
 
     pose = sweep.ego_to_world @ sweep.sensor_to_ego
     world_points = np.asarray(cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3])
-    matrix, centre = affine(boxes)
+    matrix, centre = box_maps(boxes)
     counts = [
         int(is_inside_box(world_points, matrix[box_index], centre[box_index]).sum()) for box_index in range(len(boxes))
     ]

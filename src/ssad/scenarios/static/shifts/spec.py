@@ -108,7 +108,7 @@ def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:
     return int(spec.generator("severity", scope).integers(1, 6))
 
 
-def dealt_severities(spec: ShiftSpec, scenes: Iterable[str]) -> dict[str, int]:
+def deal_severities(spec: ShiftSpec, scenes: Iterable[str]) -> dict[str, int]:
     """Deal severities 1 to 5 to scenes, each as often as any other, plus or minus one.
 
     For the physical calibration, which has one severity per scene. Independent draws (`random_severity`) leave the

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Frame, SceneContext, ShiftReport, camera_to_world
 from ssad.core.types import F32, F64, U8
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, to_device
@@ -29,7 +29,7 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 
     It is the context's, or else drawn 2 to 12 degrees high, within 15 degrees of the ego's initial heading.
     """
-    return np.array(next(_draws(spec, context)) if context.sun is None else context.sun)
+    return np.array(next(_draw_directions(spec, context)) if context.sun is None else context.sun)
 
 
 def choose_sun(
@@ -47,7 +47,7 @@ def choose_sun(
     Returns:
         Unit vector, world: the first direction in which the sun is visible; the first of all if it is always hidden.
     """
-    candidates = list(islice(_draws(spec, context), 16))
+    candidates = list(islice(_draw_directions(spec, context), 16))
     depths: dict[int, F32 | None] = {}
     for candidate in candidates:
         direction = np.array(candidate)
@@ -61,7 +61,7 @@ def choose_sun(
     return candidates[0]
 
 
-def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
+def _draw_directions(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
     """Yield unit vectors towards the sun, world, without end."""
     draws = spec.generator("sun", context.scene)
     for attempt in count():
@@ -121,23 +121,23 @@ def visible_sun_share(frame: Frame, depth: F32 | None, direction: F64) -> float:
 
 def add_sun(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply sunlight: add glare and lower the exposure with it; nothing by night or with a hidden sun."""
     local_directions = np.zeros((batch.count, 3))
     sun_pixels = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
-    records: list[Applied] = []
+    records: list[ShiftReport] = []
 
     for index, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         if context.light < NIGHT:
-            records.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
+            records.append(ShiftReport(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
             continue
         direction = sun_direction(spec, context)
         local_directions[index] = camera_to_world(frame)[:3, :3].T @ direction
         angle = sun_angle(frame, direction)
         if angle > FACING:
             records.append(
-                Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
+                ShiftReport(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
             )
             continue
         x, y = _sun_pixel(frame, direction)
@@ -145,18 +145,18 @@ def add_sun(
         in_image, visible_share = sun_in_image(frame, direction), frame.sun
         if visible_share is None:
             visible_share = (
-                visible_sun_share(frame, sun_depth(frame, batch.picture(index)), direction) if in_image else 1.0
+                visible_sun_share(frame, sun_depth(frame, batch.image(index)), direction) if in_image else 1.0
             )
         details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": in_image, "free": round(visible_share, 2)}
         details["direction"] = [round(float(coordinate), 6) for coordinate in direction]
         if not visible_share:
-            records.append(Applied(False, details, {HIDDEN: 1}))
+            records.append(ShiftReport(False, details, {HIDDEN: 1}))
             continue
         strength[index] = table.SUN_STRENGTH[spec.severity - 1] * visible_share
         # the camera adapts its exposure: the nearer the sun is to the image, the darker the rest
         outside = max(0.0, -x / batch.width, x / batch.width - 1, -y / batch.height, y / batch.height - 1)
         gain[index] = 1 - 0.06 * spec.severity * visible_share * max(0.0, 1 - 2 * outside)
-        records.append(Applied(True, details))
+        records.append(ShiftReport(True, details))
     rows, columns = grid_size(batch)
     glare = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
     rays = [
@@ -171,7 +171,7 @@ def add_sun(
     batch.launch(
         veil.glare, (batch.count, rows), [*camera_inputs, to_device(batch, strength), to_device(batch, rays)], glare
     )
-    result = batch.like()
+    result = batch.empty_like()
     tint = to_device(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
     inputs = [batch.words(), glare, tint, to_device(batch, gain), batch.width, batch.stride // 4]
     batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, result.words())

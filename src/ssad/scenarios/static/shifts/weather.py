@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Frame, SceneContext, ShiftReport, camera_to_world
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, structs, to_device
@@ -101,7 +101,7 @@ def _view_through_air(
 
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply fog in linear light (Koschmieder 1924).
 
     image * exp(-beta * range) + airlight * (1 - exp(-beta * range))
@@ -110,7 +110,7 @@ def add_fog(
     airlight = np.stack(
         [to_linear(weather.colour * context.light * 245) for weather, context in zip(weathers, contexts, strict=True)]
     )
-    result = batch.like()
+    result = batch.empty_like()
     inputs = [
         batch.words(),
         transmittance,
@@ -121,7 +121,7 @@ def add_fog(
     ]
     batch.launch(veil.blend_air, (batch.count, batch.height), inputs, result.words())
     records = [
-        Applied(True, {"range_m": table.FOG_RANGE[spec.severity - 1], "depth": source})
+        ShiftReport(True, {"range_m": table.FOG_RANGE[spec.severity - 1], "depth": source})
         for spec, source in zip(specs, sources, strict=True)
     ]
     return result, records
@@ -187,7 +187,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
 
 def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply rain or snow: a veil over the distance and streaks nearby; rain also wets the ground."""
     weathers, transmittance, depth, sources = _view_through_air(batch, frames, specs, contexts)
     if specs[0].name == "rain":
@@ -209,7 +209,7 @@ def add_precipitation(
     batch.launch(particles.splat, (batch.count, max_particles), inputs, layer)
     sky_colour = np.stack([weather.colour * context.light for weather, context in zip(weathers, contexts, strict=True)])
     grey_levels = np.array([255.0 if spec.name == "snow" else 235.0 for spec in specs])[:, None]
-    result, thread_shape = batch.like(), (batch.count, batch.height)
+    result, thread_shape = batch.empty_like(), (batch.count, batch.height)
     veil_light, particle_light = (
         to_device(batch, to_linear(sky_colour * 235), wp.vec3),
         to_device(batch, to_linear(sky_colour * grey_levels), wp.vec3),
@@ -236,7 +236,9 @@ def add_precipitation(
         )
     rates = [(table.SNOW_RATE if spec.name == "snow" else table.RAIN_RATE)[spec.severity - 1] for spec in specs]
     records = [
-        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _lens_drop_count(spec), "depth": source})
+        ShiftReport(
+            True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _lens_drop_count(spec), "depth": source}
+        )
         for rate, air, source, spec in zip(rates, air_rows, sources, specs, strict=True)
     ]
     return result, records

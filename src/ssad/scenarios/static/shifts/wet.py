@@ -45,7 +45,7 @@ def wet_ground(
     cell_light = wp.empty(shape, dtype=wp.vec3, device=batch.device)
     batch.launch(kernels.shrink, thread_shape, [batch.data, linear, batch.width, batch.height], cell_light)
     mean_light = wp.empty((batch.count, -(-rows // 8), -(-columns // 8)), dtype=float, device=batch.device)
-    batch.launch(kernels.usual_light, mean_light.shape, [ground, cell_light], mean_light)
+    batch.launch(kernels.typical_light, mean_light.shape, [ground, cell_light], mean_light)
     keys = keys_on(batch, [spec.key("hollows", frame.scene) for spec, frame in zip(specs, frames, strict=True)])
     film = to_device(batch, [table.WET_FILM[spec.severity - 1] for spec in specs])
     roughness = to_device(batch, [table.WET_ROUGH[spec.severity - 1] for spec in specs])
@@ -57,7 +57,7 @@ def wet_ground(
         shine,
     )
     darkening = to_device(batch, [table.WET_DARK[spec.severity - 1] for spec in specs])
-    result = batch.like()
+    result = batch.empty_like()
     inputs = [batch.words(), ground, shine, mean_light, darkening, linear, codes, batch.width, batch.stride // 4]
     batch.launch(kernels.blend_wet, (batch.count, batch.height), inputs, result.words())
     return result

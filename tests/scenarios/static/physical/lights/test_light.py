@@ -196,7 +196,7 @@ class Bowl:
 @pytest.mark.parametrize("how", ["swarm", "greedy", "gradient"])
 def test_searches_find_repeat_and_count(how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
-    views = [search.LitView(Bowl(), None)] * 2  # type: ignore[arg-type]
+    views = [search.SearchView(Bowl(), None)] * 2  # type: ignore[arg-type]
     given = {"detector": None, "target": TARGET, "views": views, "search": how}
     found = [search.search_light(Toy(), budget=SearchBudget(80, 8, 0.08, None), key=(k,), **given) for k in (0, 0, 1)]  # type: ignore[arg-type]
     assert found[0] == found[1]
@@ -222,7 +222,7 @@ class Egg(Bowl):
 def test_the_best_of_several_searches_counts(how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is the one that is made alone, all are counted, and many come deeper than one."""
     monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
-    given = {"detector": None, "target": TARGET, "views": [search.LitView(Egg(), None)], "search": how}
+    given = {"detector": None, "target": TARGET, "views": [search.SearchView(Egg(), None)], "search": how}
     one, many = (
         search.search_light(Toy(), budget=SearchBudget(20, 4, 0.08, None, searches=n), **given)  # type: ignore[arg-type]
         for n in (1, 12)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.schema import checked
+from ssad.core.schema import build_validated
 from ssad.scenarios.static.physical.textures.controls import CELL, control
 from ssad.scenarios.static.physical.textures.printing import (
     NOMINAL,
@@ -126,7 +126,7 @@ def test_the_mean_over_draws_comes_nearer_with_more_of_them() -> None:
 )
 def test_ranges_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=f"expectation: {next(iter(wrong))}"):
-        checked(Expectation, wrong, subject="expectation")
+        build_validated(Expectation, wrong, subject="expectation")
 
 
 def test_controls() -> None:

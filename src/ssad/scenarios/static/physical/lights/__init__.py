@@ -7,7 +7,7 @@ from typing import Any
 
 from ssad.core.errors import unknown_name
 from ssad.core.registry import make, names, resolve
-from ssad.core.schema import checked
+from ssad.core.schema import build_validated
 from ssad.scenarios.static.physical.lights.flashlight import Flashlight
 from ssad.scenarios.static.physical.lights.laser import Laser
 from ssad.scenarios.static.physical.lights.light import LightAttack, TargetSize
@@ -15,8 +15,8 @@ from ssad.scenarios.static.physical.lights.lit_image import LitImage
 from ssad.scenarios.static.physical.lights.projector import Projector
 from ssad.scenarios.static.physical.lights.search import (
     LightSearchResult,
-    LitView,
     SearchBudget,
+    SearchView,
     random_settings,
     search_light,
 )
@@ -45,7 +45,7 @@ def make_light(name: str, options: Mapping[str, Any]) -> Any:
         ConfigError: An option is unknown or has an invalid value.
     """
     if name in LIGHTS:
-        return checked(LIGHTS[name], options, subject=f"attack {name}")
+        return build_validated(LIGHTS[name], options, subject=f"attack {name}")
     if ":" not in name and name not in names("light", {}):
         raise unknown_name("light attack", name, LIGHTS)
     return make("light", name, resolve("light", {}, name), options, ("ranges", "edit"))
@@ -58,9 +58,9 @@ __all__ = [
     "LightAttack",
     "LightSearchResult",
     "LitImage",
-    "LitView",
     "Projector",
     "SearchBudget",
+    "SearchView",
     "Shadow",
     "TargetSize",
     "make_light",

@@ -96,7 +96,7 @@ def export_light(out: Path, light: LightSetup, *, name: str = "") -> list[Path]:
         "values": dict(light.values),
     }
     safeio.make_folder(out)
-    written = [out / "light.json"]
+    paths = [out / "light.json"]
     if light.colour is not None:
         assert isinstance(device, Projector)
         # PNG rounds to 8 bits; the file of floats is what `load_light` verifies and reads.
@@ -105,11 +105,11 @@ def export_light(out: Path, light: LightSetup, *, name: str = "") -> list[Path]:
         full_mask = np.ones(tuple(light.colour.shape[1:]), np.bool_)
         save_picture(out / "picture.png", texture_picture(light.colour, full_mask))
         description |= {"lumens": device.power(light.colour), "sha256": hashlib.sha256(colour_bytes).hexdigest()}
-        written += [out / "picture.png", out / "picture.npz"]
+        paths += [out / "picture.png", out / "picture.npz"]
     elif not isinstance(device, Projector):
         description["lumens"] = device.power(light.values)
     safeio.write_atomic(out / "light.json", safeio.dump_json(description, indent=1) + "\n")
-    return written
+    return paths
 
 
 def load_light(folder: Path) -> LightSetup:

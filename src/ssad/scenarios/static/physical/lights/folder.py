@@ -14,7 +14,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
-from ssad.core.schema import checked
+from ssad.core.schema import build_validated
 from ssad.core.seeding import digest
 from ssad.core.source import plugin_version
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -27,7 +27,7 @@ from ssad.scenarios.static.physical.lights import (
     random_settings,
     search_light,
 )
-from ssad.scenarios.static.physical.lights.search import LitView
+from ssad.scenarios.static.physical.lights.search import SearchView
 from ssad.scenarios.static.physical.textures.controls import control, texture_picture
 from ssad.scenarios.static.physical.textures.optimise import TextureView, train_texture
 
@@ -110,7 +110,7 @@ class LightFolder:
         spec: LightSpec,
         target: TargetSize,
         *,
-        views: Callable[[], Sequence[LitView]],
+        views: Callable[[], Sequence[SearchView]],
         projected_views: Callable[[SceneEdit], Sequence[TextureView]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
@@ -215,7 +215,7 @@ def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[SearchBudget, A
     method = options.pop("search", None)
     if method not in (None, "swarm", "greedy", "gradient"):
         raise ConfigError(f"attack {attack}: search={method!r}: choose swarm, greedy or gradient")
-    return checked(SearchBudget, options, subject=f"attack {attack}"), method
+    return build_validated(SearchBudget, options, subject=f"attack {attack}"), method
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:

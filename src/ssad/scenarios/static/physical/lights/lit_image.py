@@ -70,12 +70,12 @@ class LitImage:
         crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
         (top, left), (height, width) = self.corner, self.radiance.shape[:2]
         margin = 4 if min(height, width) > 16 else 0  # at the border of the part the lens lacks what lies beyond it
-        whole = self.before.repeat(len(change), 1, 1, 1)
+        full_images = self.before.repeat(len(change), 1, 1, 1)
         rows, columns = slice(margin, height - margin), slice(margin, width - margin)
-        whole[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = crop[
+        full_images[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = crop[
             :, :, rows, columns
         ]
-        return whole
+        return full_images
 
 
 def render_lit_image(

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.core.errors import ConfigError
-from ssad.core.schema import VALUES, Least, Number, Two, checked
+from ssad.core.schema import VALUES, Least, Number, Two, build_validated
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -116,7 +116,7 @@ class Projector:
         if isinstance(options["expectation"], Mapping):
             options["expectation"] = {**asdict(AIMED), **options["expectation"]}
         label = f"attack {self.name}"
-        attack = checked(partial(TextureAttack, self.name), options, subject=label, kind=TextureAttack)
+        attack = build_validated(partial(TextureAttack, self.name), options, subject=label, kind=TextureAttack)
         if attack.stealth:
             raise ConfigError(f"{label}: stealth={attack.stealth:g}: it is for what is printed on something")
         return attack

@@ -33,7 +33,7 @@ BATCH = 16  # images per call of a detector
 
 
 @dataclass(frozen=True, slots=True)
-class LitView:
+class SearchView:
     """Image to search on, and its ground truth, the target first."""
 
     picture: LitImage
@@ -95,7 +95,7 @@ def search_light(
     attack: LightAttack,
     detector: Detector,
     target: TargetSize,
-    views: Sequence[LitView],
+    views: Sequence[SearchView],
     *,
     budget: SearchBudget = USUAL,
     search: Literal["swarm", "greedy", "gradient"] | None = None,

@@ -8,7 +8,7 @@ from typing import Any
 
 from ssad.core.errors import ConfigError
 from ssad.core.registry import names, resolve
-from ssad.core.schema import checked
+from ssad.core.schema import build_validated
 from ssad.scenarios.static.physical.textures.optimise import TextureAttack
 
 ATTACKS: dict[str, str] = {
@@ -38,7 +38,7 @@ def make_physical(name: str, /, **settings: Any) -> TextureAttack:
     definition = resolve("physical-attack", ATTACKS, name)
     factory = definition if callable(definition) else partial(replace, definition)
     try:
-        attack = checked(factory, settings, subject=f"attack {name}", kind=TextureAttack)
+        attack = build_validated(factory, settings, subject=f"attack {name}", kind=TextureAttack)
     except TypeError as error:
         raise ConfigError(f"attack {name}: {error}") from None
     if not isinstance(attack, TextureAttack):

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.schema import VALUES, Above, Least, Part, Two
 from ssad.core.types import F64, Bool
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
-from ssad.rendering.camera.texture import paint_mask, printable, to_linear
+from ssad.rendering.camera.texture import paint_mask, to_linear, to_printable
 from ssad.rendering.meshes.mesh import Mesh, Rectangle
 from ssad.rendering.street.palette import ASPHALT
 
@@ -230,4 +230,4 @@ def covered_colour(surface: TextureSurface, mesh: Mesh, paint: tuple[float, floa
 
 def albedo_of(colour: Tensor) -> Tensor:
     """Convert a texture [3, H, W] or [B, 3, H, W], sRGB in 0 to 1, to the linear albedo of its print."""
-    return printable(to_linear(colour))
+    return to_printable(to_linear(colour))

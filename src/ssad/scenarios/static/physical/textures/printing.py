@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ssad.core.schema import Above, Least, Span
-from ssad.rendering.camera.torch_sensor import large_draws
+from ssad.rendering.camera.torch_sensor import generators_on_device
 
 _XYZ = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))  # of linear RGB
 
@@ -43,7 +43,7 @@ class Expectation:
         Args:
             colour: sRGB [3, H, W] in 0 to 1.
             generators: One for each car, on the CPU; the noise of texels is drawn on the texture's device (see
-                `large_draws`).
+                `generators_on_device`).
 
         Returns:
             [B, 3, H, W] in 0 to 1, differentiable in `colour`.
@@ -76,7 +76,7 @@ class Expectation:
         factor, offset = (parameters[:, column, None, None, None] for column in (-2, -1))
         textures = 0.5 + factor * (textures - 0.5) + offset
         if self.noise > 0.0:
-            device_generators = large_draws(generators, colour.device)
+            device_generators = generators_on_device(generators, colour.device)
             texel_noise = torch.stack(
                 [
                     torch.rand(colour.shape, generator=random_generator, device=random_generator.device)

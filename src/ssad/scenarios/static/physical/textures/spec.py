@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from ssad.core import safeio
 from ssad.core.errors import unknown_name
-from ssad.core.schema import checked
+from ssad.core.schema import build_validated
 from ssad.core.seeding import digest
 from ssad.core.source import plugin_version
 from ssad.scenarios.static.digital.objectives import LOSSES
@@ -100,4 +100,4 @@ def make_carrier(name: str, options: Mapping[str, Any]) -> Carrier:
     """
     if name not in CARRIERS:
         raise unknown_name("carrier", name, CARRIERS)
-    return checked(CARRIERS[name], options, subject=name)
+    return build_validated(CARRIERS[name], options, subject=name)

@@ -164,7 +164,7 @@ def max_field(fields: wp.uint64, current_max: int) -> int:
 
 
 @wp.func
-def greyed(fields: wp.uint64, image_weight: wp.uint64, base: wp.uint64) -> wp.uint64:
+def grey_fields(fields: wp.uint64, image_weight: wp.uint64, base: wp.uint64) -> wp.uint64:
     """Return (value * rest + base) / 1024, field by field."""
     return ((fields * image_weight + base) >> wp.uint64(10)) & FIELDS
 
@@ -179,7 +179,7 @@ def put(
 
 
 @wp.func
-def snowed(pixel: wp.uint32, part: int, add: int) -> wp.uint64:
+def snow_pixel(pixel: wp.uint32, part: int, add: int) -> wp.uint64:
     """Whiten a pixel by 1 - part / 256 and brighten it by `add`, at most 255, as fields."""
     red = int(pixel & wp.uint32(255))
     green = int((pixel >> wp.uint32(8)) & wp.uint32(255))
@@ -227,20 +227,20 @@ def blend_snow(
         w0 = image[i]
         w1 = image[i + 1]
         w2 = image[i + 2]
-        f0 = snowed(pixel_of(w0, w1, w2, 0), keep_parts, int((layer[layer_index] + layer[rotated_index]) * 255.0))
-        f1 = snowed(
+        f0 = snow_pixel(pixel_of(w0, w1, w2, 0), keep_parts, int((layer[layer_index] + layer[rotated_index]) * 255.0))
+        f1 = snow_pixel(
             pixel_of(w0, w1, w2, 1), keep_parts, int((layer[layer_index + 1] + layer[rotated_index - 1]) * 255.0)
         )
-        f2 = snowed(
+        f2 = snow_pixel(
             pixel_of(w0, w1, w2, 2), keep_parts, int((layer[layer_index + 2] + layer[rotated_index - 2]) * 255.0)
         )
-        f3 = snowed(
+        f3 = snow_pixel(
             pixel_of(w0, w1, w2, 3), keep_parts, int((layer[layer_index + 3] + layer[rotated_index - 3]) * 255.0)
         )
-        f0 = greyed(f0, image_weight, grey_offset)
-        f1 = greyed(f1, image_weight, grey_offset)
-        f2 = greyed(f2, image_weight, grey_offset)
-        f3 = greyed(f3, image_weight, grey_offset)
+        f0 = grey_fields(f0, image_weight, grey_offset)
+        f1 = grey_fields(f1, image_weight, grey_offset)
+        f2 = grey_fields(f2, image_weight, grey_offset)
+        f3 = grey_fields(f3, image_weight, grey_offset)
         row_max = put(out, i, row_max, f0, f1, f2, f3)
         i += 3
         layer_index += 4
@@ -306,7 +306,7 @@ def fall(
 
 
 @wp.func
-def rained(pixel: wp.uint32, part: int) -> wp.uint64:
+def rain_pixel(pixel: wp.uint32, part: int) -> wp.uint64:
     """Blend grey level 240 over a pixel by part / 256, as fields."""
     total = spread(pixel) * wp.uint64(256 - part) + wp.uint64(240 * part) * ONES
     return (total >> wp.uint64(8)) & FIELDS
@@ -377,14 +377,14 @@ def blend_rain(
         w1 = image[i + 1]
         w2 = image[i + 2]
         hidden = layer[j + quad]
-        f0 = rained(pixel_of(w0, w1, w2, 0), int(hidden & wp.uint32(255)))
-        f1 = rained(pixel_of(w0, w1, w2, 1), int((hidden >> wp.uint32(8)) & wp.uint32(255)))
-        f2 = rained(pixel_of(w0, w1, w2, 2), int((hidden >> wp.uint32(16)) & wp.uint32(255)))
-        f3 = rained(pixel_of(w0, w1, w2, 3), int(hidden >> wp.uint32(24)))
-        f0 = greyed(f0, image_weight, grey_offset)
-        f1 = greyed(f1, image_weight, grey_offset)
-        f2 = greyed(f2, image_weight, grey_offset)
-        f3 = greyed(f3, image_weight, grey_offset)
+        f0 = rain_pixel(pixel_of(w0, w1, w2, 0), int(hidden & wp.uint32(255)))
+        f1 = rain_pixel(pixel_of(w0, w1, w2, 1), int((hidden >> wp.uint32(8)) & wp.uint32(255)))
+        f2 = rain_pixel(pixel_of(w0, w1, w2, 2), int((hidden >> wp.uint32(16)) & wp.uint32(255)))
+        f3 = rain_pixel(pixel_of(w0, w1, w2, 3), int(hidden >> wp.uint32(24)))
+        f0 = grey_fields(f0, image_weight, grey_offset)
+        f1 = grey_fields(f1, image_weight, grey_offset)
+        f2 = grey_fields(f2, image_weight, grey_offset)
+        f3 = grey_fields(f3, image_weight, grey_offset)
         row_max = put(out, i, row_max, f0, f1, f2, f3)
         i += 3
     highest[b, y] = row_max

@@ -6,7 +6,7 @@ from ssad.scenarios.static.shifts.kernels.shared import draw
 
 
 @wp.func
-def shifted(value: wp.uint32, noise: wp.int16) -> wp.uint32:
+def add_clipped(value: wp.uint32, noise: wp.int16) -> wp.uint32:
     """Return a byte plus noise, clipped."""
     return wp.uint32(wp.clamp(int(value) + int(noise), 0, 255))
 
@@ -35,15 +35,15 @@ def add_noise(
     for i in range(begin, end):
         bits = draw(key, i)
         word = image[image_start + i]
-        low = shifted(word & wp.uint32(255), table[b, quarter(bits, 0)])
-        second = shifted((word >> wp.uint32(8)) & wp.uint32(255), table[b, quarter(bits, 16)])
-        third = shifted((word >> wp.uint32(16)) & wp.uint32(255), table[b, quarter(bits, 32)])
-        high = shifted(word >> wp.uint32(24), table[b, quarter(bits, 48)])
+        low = add_clipped(word & wp.uint32(255), table[b, quarter(bits, 0)])
+        second = add_clipped((word >> wp.uint32(8)) & wp.uint32(255), table[b, quarter(bits, 16)])
+        third = add_clipped((word >> wp.uint32(16)) & wp.uint32(255), table[b, quarter(bits, 32)])
+        high = add_clipped(word >> wp.uint32(24), table[b, quarter(bits, 48)])
         out[image_start + i] = low | (second << wp.uint32(8)) | (third << wp.uint32(16)) | (high << wp.uint32(24))
 
 
 @wp.func
-def struck(value: wp.uint32, fresh: int, fixed: int, rate: int, fixed_rate: int) -> wp.uint32:
+def apply_impulse(value: wp.uint32, fresh: int, fixed: int, rate: int, fixed_rate: int) -> wp.uint32:
     """Return a byte, or 0 or 255 where one of two draws is below its rate (of 65536)."""
     result = value
     if fixed < fixed_rate:
@@ -78,7 +78,7 @@ def add_impulses(
         result = wp.uint32(0)
         for byte_index in range(4):
             value = (word >> wp.uint32(8 * byte_index)) & wp.uint32(255)
-            value = struck(
+            value = apply_impulse(
                 value, quarter(fresh_bits, 16 * byte_index), quarter(fixed_bits, 16 * byte_index), rate, fixed_rate
             )
             result = result | (value << wp.uint32(8 * byte_index))

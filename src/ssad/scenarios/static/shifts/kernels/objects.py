@@ -297,7 +297,7 @@ def on_line(first: int, slope: float, low: int, step: int, flat: wp.bool) -> wp.
 
 
 @wp.func
-def inside(pixel: wp.vec2i, width: int, height: int) -> wp.bool:
+def is_in_image(pixel: wp.vec2i, width: int, height: int) -> wp.bool:
     """Check that a pixel lies in the image."""
     return pixel[0] >= 0 and pixel[0] < width and pixel[1] >= 0 and pixel[1] < height
 
@@ -360,7 +360,7 @@ def smear(
         entering = step + half_length
         if entering < line_length:
             pixel = on_line(first, slope, line_start, entering, is_horizontal)
-            if inside(pixel, width, height):
+            if is_in_image(pixel, width, height):
                 pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
@@ -375,7 +375,7 @@ def smear(
                     background_count += 1
         if step >= 0 and step < line_length and item_count > 0:
             pixel = on_line(first, slope, line_start, step, is_horizontal)
-            if inside(pixel, width, height):
+            if is_in_image(pixel, width, height):
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
                     pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
@@ -397,7 +397,7 @@ def smear(
         leaving = step - half_length
         if leaving >= 0 and leaving < line_length:
             pixel = on_line(first, slope, line_start, leaving, is_horizontal)
-            if inside(pixel, width, height):
+            if is_in_image(pixel, width, height):
                 pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:

@@ -78,7 +78,7 @@ def transmittance(
 
 
 @wp.func
-def through(pixel: wp.uint32, haze: wp.vec3i, clear: int, linear: wp.array(dtype=int)) -> wp.vec3i:
+def veiled_light(pixel: wp.uint32, haze: wp.vec3i, clear: int, linear: wp.array(dtype=int)) -> wp.vec3i:
     """Return the light of a pixel behind a veil that transmits `clear` of 1024 parts, in as many parts."""
     return linear_pixel(linear, pixel) * clear + haze * (PARTS - clear)
 
@@ -112,16 +112,16 @@ def blend_air(
         w1 = image[i + 1]
         w2 = image[i + 2]
         p0 = coded_pixel(
-            codes, through(pixel_of(w0, w1, w2, 0), haze, int(previous + (current - previous) * 0.625), linear)
+            codes, veiled_light(pixel_of(w0, w1, w2, 0), haze, int(previous + (current - previous) * 0.625), linear)
         )
         p1 = coded_pixel(
-            codes, through(pixel_of(w0, w1, w2, 1), haze, int(previous + (current - previous) * 0.875), linear)
+            codes, veiled_light(pixel_of(w0, w1, w2, 1), haze, int(previous + (current - previous) * 0.875), linear)
         )
         p2 = coded_pixel(
-            codes, through(pixel_of(w0, w1, w2, 2), haze, int(current + (following - current) * 0.125), linear)
+            codes, veiled_light(pixel_of(w0, w1, w2, 2), haze, int(current + (following - current) * 0.125), linear)
         )
         p3 = coded_pixel(
-            codes, through(pixel_of(w0, w1, w2, 3), haze, int(current + (following - current) * 0.375), linear)
+            codes, veiled_light(pixel_of(w0, w1, w2, 3), haze, int(current + (following - current) * 0.375), linear)
         )
         put_four(out, i, p0, p1, p2, p3)
         i += 3
@@ -137,14 +137,14 @@ def opacity(layer: wp.array3d(dtype=int), b: int, near_row: int, far_row: int, c
 
 
 @wp.func
-def behind(
+def light_behind_particles(
     pixel: wp.uint32, haze: wp.vec3i, clear: float, white: wp.vec3i, cover: int, linear: wp.array(dtype=int)
 ) -> wp.vec3i:
     """Return the light of a pixel through the veil and under particles, in 1024 parts.
 
     The particles hide cover / 1,048,576 of it.
     """
-    mixed = through(pixel, haze, int(clear), linear)
+    mixed = veiled_light(pixel, haze, int(clear), linear)
     if cover > 0:
         hidden_parts = wp.min(cover >> 10, PARTS)
         visible_parts = PARTS - hidden_parts
@@ -195,19 +195,27 @@ def blend_particles(
         w2 = image[i + 2]
         p0 = coded_pixel(
             codes,
-            behind(pixel_of(w0, w1, w2, 0), haze, previous + (current - previous) * 0.625, light, 3 * o1 + o0, linear),
+            light_behind_particles(
+                pixel_of(w0, w1, w2, 0), haze, previous + (current - previous) * 0.625, light, 3 * o1 + o0, linear
+            ),
         )
         p1 = coded_pixel(
             codes,
-            behind(pixel_of(w0, w1, w2, 1), haze, previous + (current - previous) * 0.875, light, 3 * o1 + o2, linear),
+            light_behind_particles(
+                pixel_of(w0, w1, w2, 1), haze, previous + (current - previous) * 0.875, light, 3 * o1 + o2, linear
+            ),
         )
         p2 = coded_pixel(
             codes,
-            behind(pixel_of(w0, w1, w2, 2), haze, current + (following - current) * 0.125, light, 3 * o2 + o1, linear),
+            light_behind_particles(
+                pixel_of(w0, w1, w2, 2), haze, current + (following - current) * 0.125, light, 3 * o2 + o1, linear
+            ),
         )
         p3 = coded_pixel(
             codes,
-            behind(pixel_of(w0, w1, w2, 3), haze, current + (following - current) * 0.375, light, 3 * o2 + o3, linear),
+            light_behind_particles(
+                pixel_of(w0, w1, w2, 3), haze, current + (following - current) * 0.375, light, 3 * o2 + o3, linear
+            ),
         )
         put_four(out, i, p0, p1, p2, p3)
         i += 3

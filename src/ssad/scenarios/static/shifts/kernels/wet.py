@@ -144,7 +144,7 @@ def shrink(
 
 
 @wp.kernel
-def usual_light(ground: wp.array3d(dtype=float), light: wp.array3d(dtype=wp.vec3), out: wp.array3d(dtype=float)):
+def typical_light(ground: wp.array3d(dtype=float), light: wp.array3d(dtype=wp.vec3), out: wp.array3d(dtype=float)):
     """Compute the geometric mean light of the ground around each eighth cell, 24 x 24 cells, robust to paint."""
     b, block_row, block_column = wp.tid()
     total = float(0.0)
@@ -168,7 +168,7 @@ def on_grid(focal: wp.vec4, p: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def seen_at(light: wp.array3d(dtype=wp.vec3), b: int, x: float, y: float) -> wp.vec3:
+def light_at_position(light: wp.array3d(dtype=wp.vec3), b: int, x: float, y: float) -> wp.vec3:
     """Return the light at a position of the quarter grid, interpolated between columns, clamped at the border."""
     row = wp.clamp(int(wp.floor(y)), 0, light.shape[1] - 1)
     left = wp.floor(x - 0.5)
@@ -178,13 +178,15 @@ def seen_at(light: wp.array3d(dtype=wp.vec3), b: int, x: float, y: float) -> wp.
 
 
 @wp.func
-def mirrored(ray: wp.vec3, up: wp.vec3, rise: float, d: float, s: float) -> wp.vec3:
+def mirror_point(ray: wp.vec3, up: wp.vec3, rise: float, d: float, s: float) -> wp.vec3:
     """Return the point at depth s of a ray (camera frame, depth 1), mirrored at its ground hit at depth d."""
     return ray * s - up * (2.0 * rise * (s - d))
 
 
 @wp.func
-def meets(depth: wp.array3d(dtype=float), ground: wp.array3d(dtype=float), b: int, focal: wp.vec4, p: wp.vec3) -> bool:
+def is_on_surface(
+    depth: wp.array3d(dtype=float), ground: wp.array3d(dtype=float), b: int, focal: wp.vec4, p: wp.vec3
+) -> bool:
     """Check that a point lies on, or slightly behind, a visible surface that is not ground."""
     if p[2] < 0.5:
         return False
@@ -234,7 +236,7 @@ def mirror(
             for _step in range(STEPS):
                 if hit_depth == 0.0:
                     step_depth *= RATIO
-                    if meets(depth, ground, b, focal, mirrored(ray, up, rise, ground_depth, step_depth)):
+                    if is_on_surface(depth, ground, b, focal, mirror_point(ray, up, rise, ground_depth, step_depth)):
                         hit_depth = step_depth
             target = ray - up * (2.0 * rise)  # point at infinity: direction of the mirrored ray
             blur = rough[b] * focal[1] * 0.25
@@ -243,11 +245,11 @@ def mirror(
                 near_depth = hit_depth / RATIO
                 for _step in range(4):
                     mid_depth = 0.5 * (near_depth + hit_depth)
-                    if meets(depth, ground, b, focal, mirrored(ray, up, rise, ground_depth, mid_depth)):
+                    if is_on_surface(depth, ground, b, focal, mirror_point(ray, up, rise, ground_depth, mid_depth)):
                         hit_depth = mid_depth
                     else:
                         near_depth = mid_depth
-                target = mirrored(ray, up, rise, ground_depth, hit_depth)
+                target = mirror_point(ray, up, rise, ground_depth, hit_depth)
                 blur *= 1.0 - ground_depth / hit_depth
             reflection = wp.vec3(0.0, 0.0, 0.0)
             if target[2] > 0.01:
@@ -256,7 +258,7 @@ def mirror(
                 for tap_index in range(9):
                     tap_offset = float(tap_index - 4) * 0.25
                     share = 1.0 - tap_offset * tap_offset * 0.8
-                    reflection += seen_at(light, b, position[0], position[1] + blur * tap_offset) * share
+                    reflection += light_at_position(light, b, position[0], position[1] + blur * tap_offset) * share
                     weight += share
                 reflection = reflection / weight
             world_point = wp.transform_point(to_world[b], ray * ground_depth)
@@ -284,7 +286,7 @@ def between(grid: wp.array3d(dtype=Any), b: int, row: int, fraction: float, colu
 
 
 @wp.func
-def wetted(
+def wet_pixel(
     pixel: wp.uint32,
     covered: float,
     shine: wp.vec4,
@@ -314,7 +316,7 @@ def blend_wet(
     image: wp.array(dtype=wp.uint32),
     ground: wp.array3d(dtype=float),
     shine: wp.array3d(dtype=wp.vec4),
-    usual: wp.array3d(dtype=float),
+    typical: wp.array3d(dtype=float),
     dark: wp.array(dtype=float),
     linear: wp.array(dtype=int),
     codes: wp.array(dtype=wp.uint8),
@@ -331,7 +333,7 @@ def blend_wet(
     row_max = float(0.0)
     for x in range(ground.shape[2]):
         row_max = wp.max(row_max, between(ground, b, row, fraction, x))
-    # Rows without wet ground are copied; `wetted` acts from a half on.
+    # Rows without wet ground are copied; `wet_pixel` acts from a half on.
     if row_max <= 0.5:
         for word_index in range(width * 3 / 4):
             out[i + word_index] = image[i + word_index]
@@ -347,9 +349,9 @@ def blend_wet(
         w1 = image[i + 1]
         w2 = image[i + 2]
         if g0 + g1 + g2 > 0.0:
-            mean_light = usual[b, y / 32, wp.min(quad / 8, usual.shape[2] - 1)]
+            mean_light = typical[b, y / 32, wp.min(quad / 8, typical.shape[2] - 1)]
             darkening = dark[b]
-            p0 = wetted(
+            p0 = wet_pixel(
                 pixel_of(w0, w1, w2, 0),
                 g0 + (g1 - g0) * 0.625,
                 s0 + (s1 - s0) * 0.625,
@@ -358,7 +360,7 @@ def blend_wet(
                 linear,
                 codes,
             )
-            p1 = wetted(
+            p1 = wet_pixel(
                 pixel_of(w0, w1, w2, 1),
                 g0 + (g1 - g0) * 0.875,
                 s0 + (s1 - s0) * 0.875,
@@ -367,7 +369,7 @@ def blend_wet(
                 linear,
                 codes,
             )
-            p2 = wetted(
+            p2 = wet_pixel(
                 pixel_of(w0, w1, w2, 2),
                 g1 + (g2 - g1) * 0.125,
                 s1 + (s2 - s1) * 0.125,
@@ -376,7 +378,7 @@ def blend_wet(
                 linear,
                 codes,
             )
-            p3 = wetted(
+            p3 = wet_pixel(
                 pixel_of(w0, w1, w2, 3),
                 g1 + (g2 - g1) * 0.375,
                 s1 + (s2 - s1) * 0.375,

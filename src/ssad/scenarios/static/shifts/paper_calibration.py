@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Frame
+from ssad.core.frames import Frame, ShiftReport
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, file_keys, to_device
 from ssad.scenarios.static.shifts.kernels import falling, layers
@@ -23,7 +23,7 @@ from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
-Result = tuple[Batch, list[Applied]]
+Result = tuple[Batch, list[ShiftReport]]
 WIDTH: Final = 1600  # pixels: image width of the published lengths
 CLOUDS: Final = 2048  # side of the published clouds at that width, pixels
 GATE: Final = 32  # rows of the map that varies the density of rain over the image
@@ -106,7 +106,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     ]
     batch.launch(falling.streaks, half_shape, inputs, streak_layer.flatten())
     thread_shape = (batch.count, batch.height)
-    result, highest = batch.like(), wp.empty(thread_shape, dtype=int, device=batch.device)
+    result, highest = batch.empty_like(), wp.empty(thread_shape, dtype=int, device=batch.device)
     inputs = [
         batch.words(),
         streak_layer.flatten(),
@@ -119,7 +119,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     ]
     batch.launch(falling.blend_snow, thread_shape, inputs, result.words())
     _darken(result, highest)
-    return result, [Applied(True, {"angle_deg": round(float(angle_value), 1)}) for angle_value in angles_deg]
+    return result, [ShiftReport(True, {"angle_deg": round(float(angle_value), 1)}) for angle_value in angles_deg]
 
 
 def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
@@ -176,7 +176,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         _samples_per_side(scale),
     ]
     batch.launch(falling.curtain, thread_shape, inputs, opacity)
-    result, highest = batch.like(), wp.empty(thread_shape, dtype=int, device=batch.device)
+    result, highest = batch.empty_like(), wp.empty(thread_shape, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
     opacity_words = wp.array(ptr=opacity.ptr, dtype=wp.uint32, shape=size, device=batch.device)
     opacity_words._keep = opacity  # the memory belongs to the bytes
@@ -185,7 +185,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     _darken(result, highest)
     details = zip(density, streak_lengths, strict=True)
     return result, [
-        Applied(True, {"density": round(float(density_value), 3), "streak_px": round(float(streak_length))})
+        ShiftReport(True, {"density": round(float(density_value), 3), "streak_px": round(float(streak_length))})
         for density_value, streak_length in details
     ]
 
@@ -224,12 +224,12 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     inputs = [batch.words(), batch.width * 3 // 4, batch.stride // 4]
     batch.launch(layers.brightest, thread_shape, inputs, highest)
     brightest = highest.numpy().max(1) / 255
-    result = batch.like()
+    result = batch.empty_like()
     cloud_parameters = [to_device(batch, values) for values in (lowest, span, amounts, brightest, grey_shares)]
     inputs = [batch.data, clouds, *cloud_parameters, WIDTH / batch.width / 4, batch.width, batch.stride]
     batch.launch(layers.blend_clouds, thread_shape, inputs, result.data)
     return result, [
-        Applied(True, {"amount": float(amount_value), "decay": float(decay_value)})
+        ShiftReport(True, {"amount": float(amount_value), "decay": float(decay_value)})
         for amount_value, decay_value in zip(amounts, decays, strict=True)
     ]
 
@@ -255,7 +255,7 @@ def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
         flare_x = line_x[int(flare_share * max(len(line_x) - 1, 1))] if len(line_x) else 0.0
         flares.append([flare_x, slope * (flare_x - x) + y, flare_size if len(line_x) else 0.0])
         suns.append([x, y, table.PAPER_SUN[spec.severity - 1] * scale])
-        records.append(Applied(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(suns[-1][2])}))
+        records.append(ShiftReport(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(suns[-1][2])}))
     result = batch.copy()
     disc_parameters = [to_device(batch, values, wp.vec3) for values in (suns, flares, colours)]
     inputs = [batch.data, *disc_parameters, to_device(batch, strengths), batch.width, batch.stride]

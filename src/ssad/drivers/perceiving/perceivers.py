@@ -24,7 +24,7 @@ from ssad.core.protocols import Detector
 from ssad.core.rotations import Floats, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode
-from ssad.core.visibility import in_sight
+from ssad.core.visibility import is_visible
 from ssad.detectors import make_detector
 from ssad.drivers.perceiving.objects import SIZES
 from ssad.drivers.perceiving.tracker import tracking_settings
@@ -58,7 +58,7 @@ def camera_perceiver(
     weights: str | None = None,
     threshold: float | None = None,
     input_width: int | None = None,
-) -> CameraEyes:
+) -> CameraPerceiver:
     """Return the built-in perceiver of camera images.
 
     Args:
@@ -75,9 +75,9 @@ def camera_perceiver(
     """
     options: dict[str, Any] = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
     min_score = tracking_settings(detector).low if threshold is None else threshold
-    eyes = CameraEyes(detector, _rig_cameras(cameras, width), threshold=min_score, **options)
-    _ = eyes.detector  # so that a wrong name fails here
-    return eyes
+    perceiver = CameraPerceiver(detector, _rig_cameras(cameras, width), threshold=min_score, **options)
+    _ = perceiver.detector  # so that a wrong name fails here
+    return perceiver
 
 
 def perfect_perceiver(
@@ -89,9 +89,9 @@ def perfect_perceiver(
     burst: float = 3.0,
     noise: float = 0.0,
     phantoms: float = 0.0,
-) -> PerfectEyes:
-    """Return the built-in perceiver that knows the truth; arguments as of `camera_perceiver` and `PerfectEyes`."""
-    return PerfectEyes(
+) -> PerfectPerceiver:
+    """Return the built-in perceiver that knows the truth; arguments as of `camera_perceiver` and `PerfectPerceiver`."""
+    return PerfectPerceiver(
         _rig_cameras(cameras, width), reach=reach, missed=missed, burst=burst, noise=noise, phantoms=phantoms
     )
 
@@ -106,7 +106,7 @@ def _rig_cameras(channels: Sequence[str], width: int) -> dict[str, Camera]:
     return nuscenes_cameras(width, channels)
 
 
-class CameraEyes:
+class CameraPerceiver:
     """Detector on camera images. An image that is 0 everywhere counts as a detected loss of signal.
 
     Args:
@@ -232,11 +232,11 @@ def _row_indices(rows: I64, reference: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(rows).to(reference.device)
 
 
-class PerfectEyes:
+class PerfectPerceiver:
     """Perfect detector that knows the truth: it finds every visible object at its true position.
 
     An object is found if its centre is in front of a camera, a part of its outline is in the image, and it is not
-    hidden (see `ssad.core.visibility.in_sight`). `missed`, `noise` and `phantoms` add the failures of real detectors.
+    hidden (see `ssad.core.visibility.is_visible`). `missed`, `noise` and `phantoms` add the failures of real detectors.
 
     Args:
         cameras: Cameras by name; None: the front camera of nuScenes.
@@ -284,7 +284,7 @@ class PerfectEyes:
         """Return the visible objects as detections, with the configured errors."""
         truth: Belief = view.readings["truth"]
         truth = truth.rows(rows)
-        visible = in_sight(view.pose[rows, :2], truth, self.reach)
+        visible = is_visible(view.pose[rows, :2], truth, self.reach)
         distance_factors = np.ones(visible.shape)
         for index, scene in enumerate(view.scene[rows].tolist()):
             draws, count = self._draws[scene], visible.shape[1]
@@ -367,8 +367,8 @@ def project_boxes(
     if shift is not None:
         local = local * shift[:, None]
     direction = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ to_camera[:3, :3].T
-    moving = np.column_stack([velocity, np.zeros(len(yaw))]) @ to_camera[:3, :3].T
-    return _detections(local, size, camera_yaw(direction), kind, moving[:, [0, 2]], camera)
+    camera_velocity = np.column_stack([velocity, np.zeros(len(yaw))]) @ to_camera[:3, :3].T
+    return _detections(local, size, camera_yaw(direction), kind, camera_velocity[:, [0, 2]], camera)
 
 
 def _detections(  # noqa: PLR0917  # columns

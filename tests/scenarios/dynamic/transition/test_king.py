@@ -13,8 +13,8 @@ from ssad.core.generators import Base, Outcome
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, search
-from ssad.scenarios.dynamic.transition import kinematics
-from ssad.scenarios.dynamic.transition.kinematics import King
+from ssad.scenarios.dynamic.transition import king as king_module
+from ssad.scenarios.dynamic.transition.king import King
 from ssad.scenarios.dynamic.transition.road import raster_of
 from ssad.world.roads import load_town
 from ssad.world.twin import MotionState, RoadField, bodies_of, box_gap, unroll
@@ -64,7 +64,7 @@ def test_controls_repeat_what_was_recorded(bases: list[Base]) -> None:
         for agent, (start, controls) in king._recorded[k].items():
             bodies = bodies_of([base.trace.models[agent]], dtype=torch.float64)
             first = MotionState(*(part[None] for part in start))
-            pose = unroll(first, controls[:, None], bodies, dt=kinematics.STEP, substeps=1).pose[:, 0].numpy()
+            pose = unroll(first, controls[:, None], bodies, dt=king_module.STEP, substeps=1).pose[:, 0].numpy()
             recorded = king._motion[k][agent]
             there = recorded[:, 5] > 0.5
             assert np.hypot(*(pose[there, :2] - recorded[there, :2]).T).max() < 1.5
@@ -74,8 +74,8 @@ def test_gaps_of_far_boxes_are_rough_and_of_near_ones_exact() -> None:
     draws = torch.Generator().manual_seed(0)
     one = torch.rand((500, 5), generator=draws, dtype=torch.float64) * torch.tensor([40.0, 40.0, 6.0, 3.0, 1.0]) + 1.5
     two = one.flip(0)
-    exact, found = box_gap(one, two), kinematics._gap(one, two)
-    near = found < kinematics.FAR - 1.0
+    exact, found = box_gap(one, two), king_module._gap(one, two)
+    near = found < king_module.FAR - 1.0
     assert near.sum() > 20
     assert torch.equal(found[near], exact[near])
     assert (found - exact).abs().max() < 3.0
@@ -85,7 +85,7 @@ def test_king_finds_what_a_blind_driver_runs_into(bases: list[Base]) -> None:
     assert all(base.trace.end != "collision" for base in bases)
     rows = search(King(bases[1:], seeds=[2], budget=4), bases[1:], TRIALS, budget=4, batch=4)
     for row in rows:
-        found = [outcome for outcome in row if outcome.valid]
+        found = [outcome for outcome in row if outcome.is_valid]
         assert found
         assert found[0].trace is not None
         assert len(found[0].adversaries) == 1
@@ -95,7 +95,7 @@ def test_king_finds_what_a_blind_driver_runs_into(bases: list[Base]) -> None:
 
 
 def test_what_king_proposes_does_not_depend_on_the_batch(bases: list[Base], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinematics, "ITERATIONS", 3)
+    monkeypatch.setattr(king_module, "ITERATIONS", 3)
     together = King(bases, seeds=[1, 2], budget=4).ask(2)
     alone = King(bases[1:], seeds=[2], budget=4).ask(2)
     assert together[1] == alone[0]
@@ -110,7 +110,7 @@ def test_a_base_without_vehicles_is_told_in_a_line(bases: list[Base]) -> None:
 
 
 def test_a_search_that_diverges_is_told_in_a_line(bases: list[Base], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinematics, "ITERATIONS", 1)
+    monkeypatch.setattr(king_module, "ITERATIONS", 1)
     king = King(bases, seeds=[0, 0], budget=4)
     king.ask(1)
     king._chains[1][0].change[:] = np.nan
@@ -119,7 +119,7 @@ def test_a_search_that_diverges_is_told_in_a_line(bases: list[Base], monkeypatch
 
 
 def test_a_chain_that_leaves_the_road_is_led_back_harder(bases: list[Base], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinematics, "ITERATIONS", 1)
+    monkeypatch.setattr(king_module, "ITERATIONS", 1)
     king = King(bases, seeds=[0, 0], budget=8)
     (first,), (second,) = king.ask(1)
     trace = bases[0].trace

@@ -23,7 +23,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode, EpisodeTrace, Scenario
-from ssad.scenarios.dynamic.frozen import frozen, with_motion
+from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
 from ssad.scenarios.dynamic.transition.road import raster_of
 from ssad.world.models import model
 from ssad.world.twin import Bodies, MotionState, advance, bodies_of, box_gap, unroll
@@ -58,7 +58,7 @@ class _Chain:
         change: [K, 2] change of effort and steering at the knots, added to the recorded controls.
         ego: The ego's box and presence [T + 1, 6] in the last rollout.
         weight: Weight of the costs of the road and other agents.
-        tried: Rollouts so far.
+        tried_count: Rollouts so far.
     """
 
     base: int
@@ -66,7 +66,7 @@ class _Chain:
     change: F64
     ego: F64
     weight: float = 1.0
-    tried: int = 0
+    tried_count: int = 0
 
 
 class King:
@@ -78,10 +78,10 @@ class King:
         self.bases = list(bases)
         self.budget = budget
         self._seeds = list(seeds)
-        self._frozen = [frozen(base.episode, base.trace) for base in bases]
-        self._agents = [adversaries(base) for base in bases]
-        self._motion = [sampled(base.trace) for base in bases]
-        self._recorded = self._as_recorded()
+        self._frozen = [freeze_episode(base.episode, base.trace) for base in bases]
+        self._agents = [adversary_candidates(base) for base in bases]
+        self._motion = [resample_trace(base.trace) for base in bases]
+        self._recorded = self._recorded_controls()
         self._road = raster_of(
             [base.graph for base in bases],
             [
@@ -124,14 +124,14 @@ class King:
         for base_index, base_outcomes in enumerate(outcomes):
             for chain_index, outcome in enumerate(base_outcomes):
                 chain = self._chains[base_index][chain_index]
-                chain.tried += 1
+                chain.tried_count += 1
                 is_hopeless = outcome.gap is None or outcome.gap > HOPELESS
-                if is_hopeless and chain.tried >= 2:
+                if is_hopeless and chain.tried_count >= 2:
                     self._abandoned[base_index].add(chain.agent)
-                if outcome.trace is None or outcome.valid or chain.tried >= (2 if is_hopeless else PATIENCE):
+                if outcome.trace is None or outcome.is_valid or chain.tried_count >= (2 if is_hopeless else PATIENCE):
                     self._chains[base_index][chain_index] = self._new_chain(base_index)
                     continue
-                chain.ego = sampled(outcome.trace)[0]
+                chain.ego = resample_trace(outcome.trace)[0]
                 if outcome.off_road or outcome.hit_others:
                     chain.weight *= 2.0
 
@@ -149,7 +149,7 @@ class King:
             change[:, 0] += 0.1  # a standing vehicle without throttle has no gradient
         return _Chain(base, agent, change, self._motion[base][0])
 
-    def _as_recorded(self) -> list[dict[int, tuple[MotionState, Tensor]]]:
+    def _recorded_controls(self) -> list[dict[int, tuple[MotionState, Tensor]]]:
         """Return start state and controls [T, 4] with which the twin repeats each candidate of each base."""
         candidates = [(base_index, agent) for base_index, agents in enumerate(self._agents) for agent in agents]
         bodies = bodies_of(
@@ -161,7 +161,7 @@ class King:
             dtype=torch.float64,
         )
         start = MotionState(motion[:, 0, :3], speed, torch.zeros_like(speed))
-        controls = tracked(start, motion[..., :3].transpose(0, 1), bodies)
+        controls = follow_poses(start, motion[..., :3].transpose(0, 1), bodies)
         recorded: list[dict[int, tuple[MotionState, Tensor]]] = [{} for _ in self.bases]
         for row, (base_index, agent) in enumerate(candidates):
             recorded[base_index][agent] = MotionState(*(part[row] for part in start)), controls[:, row]
@@ -256,7 +256,7 @@ class King:
         return ego_cost + weight * (OTHERS * (intrusion * time_weight).amax(1) + ROAD * road_cost)
 
 
-def adversaries(base: Base) -> list[int]:
+def adversary_candidates(base: Base) -> list[int]:
     """Return the vehicles present from the start, nearest to the ego's route first.
 
     Raises:
@@ -282,7 +282,7 @@ def _no_adversary_error(scenario: Scenario) -> ConfigError:
     )
 
 
-def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
+def follow_poses(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
     """Return controls [T, N, 4] with which the twin follows poses [T + 1, N, 3] as closely as the bodies allow."""
     state, controls = start, []
     for pose, next_pose in pairwise(poses):
@@ -339,7 +339,7 @@ def _corners(box: Tensor) -> Tensor:
     return torch.stack([box[..., 0:1] + cos * along - sin * across, box[..., 1:2] + sin * along + cos * across], -1)
 
 
-def sampled(trace: EpisodeTrace) -> F64:
+def resample_trace(trace: EpisodeTrace) -> F64:
     """Resample a trace to boxes and presence [A, T + 1, 6] at the optimisation steps; absent after its end."""
     row_position = STEP * np.arange(STEPS + 1) / trace.dt
     last_row = len(trace.active) - 1

@@ -27,9 +27,9 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Bool, Controller, EpisodeTrace
 from ssad.scenarios.dynamic.episode import build_episode
-from ssad.scenarios.dynamic.frozen import frozen, with_motion
+from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
 from ssad.scenarios.dynamic.sets import load_scenarios
-from ssad.scenarios.dynamic.transition.kinematics import STEP, King, adversaries, sampled
+from ssad.scenarios.dynamic.transition.king import STEP, King, adversary_candidates, resample_trace
 from ssad.scenarios.dynamic.transition.road import raster_of
 
 LENGTH: Final = 32  # steps of 0.25 s: 8 s, as CAT's forecast
@@ -67,21 +67,21 @@ class Cat:
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
         self.bases = list(bases)
-        self._frozen = [frozen(base.episode, base.trace) for base in bases]
-        self._motion = [sampled(base.trace) for base in bases]
+        self._frozen = [freeze_episode(base.episode, base.trace) for base in bases]
+        self._motion = [resample_trace(base.trace) for base in bases]
         self._untried = [self._candidates(base_index, seed) for base_index, seed in enumerate(seeds)]
         self._egos: list[deque[F64]] = [deque([motion[0]], maxlen=ANSWERS) for motion in self._motion]
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Propose the untried candidates with the largest products."""
-        return [self._best(base_index, count) for base_index in range(len(self.bases))]
+        return [self._best_proposals(base_index, count) for base_index in range(len(self.bases))]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
         """Store the ego's trajectories."""
         for egos, base_outcomes in zip(self._egos, outcomes, strict=True):
-            egos.extend(sampled(outcome.trace)[0] for outcome in base_outcomes if outcome.trace is not None)
+            egos.extend(resample_trace(outcome.trace)[0] for outcome in base_outcomes if outcome.trace is not None)
 
-    def _best(self, base: int, count: int) -> list[Proposal]:
+    def _best_proposals(self, base: int, count: int) -> list[Proposal]:
         untried = self._untried[base]
         scores = [self._score(base, candidate) for candidate in untried]
         best_indices = sorted(range(len(untried)), key=lambda index: scores[index], reverse=True)[:count]
@@ -118,12 +118,12 @@ class Cat:
 
     def _candidates(self, base: int, seed: int) -> list[_Candidate]:
         """Return all plausible trajectories of all opponents and start steps, each with its prior."""
-        motions, speeds = traffic()
+        motions, speeds = traffic_motions()
         motion = self._motion[base]
         last_step = int(np.flatnonzero(motion[0, :, 5] > 0.5)[-1])
         random = generator("cat", seed)
         candidates: list[_Candidate] = []
-        for agent in adversaries(self.bases[base]):
+        for agent in adversary_candidates(self.bases[base]):
             for start in range(0, max(last_step - LENGTH // 4, 1), STARTS):
                 current = motion[agent, start]
                 if current[5] < 0.5:
@@ -135,7 +135,7 @@ class Cat:
                 pose = np.concatenate(
                     [to_world(current[:3], motions[selected, :, :2]), motions[selected, :, 2:] + current[2]], -1
                 )
-                priors = weights[selected] * self._plausible(base, agent, start, pose)
+                priors = weights[selected] * self._plausibility(base, agent, start, pose)
                 if priors.sum() > 0.0:
                     priors = priors / priors.sum()
                 candidates += [
@@ -145,7 +145,7 @@ class Cat:
                 ]
         return candidates
 
-    def _plausible(self, base: int, agent: int, start: int, pose: F64) -> F64:
+    def _plausibility(self, base: int, agent: int, start: int, pose: F64) -> F64:
         """Return 1 for trajectories [M, T + 1, 3] on the road and clear of all agents but the ego, else 0."""
         motion = self._motion[base]
         steps = np.minimum(np.arange(start, start + LENGTH + 1), motion.shape[1] - 1)[::STRIDE]
@@ -167,7 +167,7 @@ class Cat:
 
 
 @lru_cache(maxsize=1)
-def traffic() -> tuple[F64, F64]:
+def traffic_motions() -> tuple[F64, F64]:
     """Return the motions that the prior is learned from: vehicles of the Autopilot in natural scenarios.
 
     Returns:
@@ -182,13 +182,13 @@ def traffic() -> tuple[F64, F64]:
     graphs = {name: load_town(name) for name in {scenario.town for scenario in selected}}
     # a separate seed: the prior must not come from the searched episodes
     episodes = [build_episode(scenario, graphs[scenario.town], seed=1_000_003) for scenario in selected]
-    recorded = [windows(trace) for trace in rollout(World(episodes, graphs, ego=Controller.AUTOPILOT), {})]
+    recorded = [motion_windows(trace) for trace in rollout(World(episodes, graphs, ego=Controller.AUTOPILOT), {})]
     return np.concatenate([motions for motions, _ in recorded]), np.concatenate([scenario for _, scenario in recorded])
 
 
-def windows(trace: EpisodeTrace) -> tuple[F64, F64]:
+def motion_windows(trace: EpisodeTrace) -> tuple[F64, F64]:
     """Return all motions of 8 s in a trace, one of each vehicle every second, as `traffic` does."""
-    motion = sampled(trace)
+    motion = resample_trace(trace)
     motions, speeds = [np.zeros((0, LENGTH + 1, 3))], [0.0][:0]
     for agent in np.flatnonzero(trace.kind <= AgentKind.BICYCLE).tolist():
         for start in range(0, motion.shape[1] - LENGTH - 1, STARTS):

@@ -28,7 +28,7 @@ class _IdentityKey:
         return isinstance(other, _IdentityKey) and self.value is other.value
 
 
-def remembered(max_size: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+def cached_by_identity(max_size: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Cache the results of a function; lane graphs and routes count as equal if they are one object.
 
     Args:

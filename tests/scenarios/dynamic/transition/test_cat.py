@@ -12,8 +12,8 @@ from ssad.core.generators import Base
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials
-from ssad.scenarios.dynamic.transition import trajectory
-from ssad.scenarios.dynamic.transition.trajectory import Cat, traffic
+from ssad.scenarios.dynamic.transition import cat as cat_module
+from ssad.scenarios.dynamic.transition.cat import Cat, traffic_motions
 from ssad.world.roads import load_town
 from ssad.world.roads.query import LaneQuery
 
@@ -27,8 +27,8 @@ def base() -> Base:
 @pytest.fixture(scope="module")
 def untouched(base: Base) -> Cat:
     patch = pytest.MonkeyPatch()
-    patch.setattr(trajectory, "EPISODES", 4)
-    traffic.cache_clear()
+    patch.setattr(cat_module, "EPISODES", 4)
+    traffic_motions.cache_clear()
     made = Cat([base], seeds=[1], budget=8)
     patch.undo()
     return made
@@ -43,7 +43,7 @@ def cat(untouched: Cat) -> Cat:
 
 
 def test_recorded_motions_start_at_the_origin_and_can_be_driven(cat: Cat) -> None:
-    motions, speeds = traffic()
+    motions, speeds = traffic_motions()
     assert len(motions) == len(speeds) > 50
     assert np.abs(motions[:, 0]).max() < 1e-9
     assert motions[:, 4, 0].min() > -0.5  # nobody drives backwards
@@ -71,7 +71,7 @@ def test_the_score_sums_over_the_egos_rollouts_and_falls_with_the_time(cat: Cat)
         rows[:, :2] += 1.0e4
         rows[:, 5] = 1.0
         if meets is not None:
-            steps = np.arange(meets, trajectory.LENGTH + 1)
+            steps = np.arange(meets, cat_module.LENGTH + 1)
             rows[candidate.start + steps, :3] = candidate.pose[steps]
         return rows
 
