@@ -7,6 +7,7 @@ key that is gone fail the first test.
 
 from __future__ import annotations
 
+import inspect
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -250,7 +251,7 @@ NOT_OBJECTS: dict[str, str] = {
     "DetectorTable.data": "a folder",
     "DetectorTable.version": "a version of its data",
     "DetectorTable.split": "a split of its data",
-    "Recorded.towns": "towns: maps that are imported, not code",
+    "RecordedData.towns": "towns: maps that are imported, not code",
     "PerceptionSuite.target_town": "a town",
     "Pair.train": "a town",
     "Pair.test": "a town",
@@ -306,7 +307,7 @@ def names_in(kind: str) -> list[TextKey]:
 
 def _keys(kind: str, schema: type[BaseModel], prefix: str) -> Iterator[TextKey]:
     for key, info in schema.model_fields.items():
-        holders = [base for base in schema.__mro__ if key in base.__dict__.get("__annotations__", {})]
+        holders = [base for base in schema.__mro__ if key in inspect.get_annotations(base)]
         for part in _parts(info.annotation):
             if isinstance(part, type) and issubclass(part, BaseModel):
                 family = ""

@@ -101,7 +101,7 @@ def plugin_version(kind: str, table: Mapping[str, str], name: str) -> str:
     Raises:
         UnknownNameError, ConfigError: As for `resolve`.
     """
-    name = Reference.of(name).name
+    name = Reference.parse(name).name
     if name in table:
         return ""
     target, origin = resolve(kind, table, name), names(kind, table).get(name, name)

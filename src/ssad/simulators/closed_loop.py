@@ -67,7 +67,7 @@ def simulator_version(name: str) -> str:
         UnknownNameError: There is no such simulator.
         ConfigError: It takes no such arguments.
     """
-    target = resolve("simulator", SIMULATORS, Reference.of(name).name)
+    target = resolve("simulator", SIMULATORS, Reference.parse(name).name)
     check_arguments("simulator", name, target, extra_arguments={"episodes": (), "graphs": {}, "device": "cpu"})
     return plugin_version("simulator", SIMULATORS, name)
 
@@ -87,7 +87,7 @@ def make_simulator(
         UnknownNameError: There is no such simulator.
         ConfigError: It cannot be made, or lacks an attribute or a method of `ssad.core.driving.Simulator`.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     target = resolve("simulator", SIMULATORS, reference.name)
     options = {"episodes": episodes, "graphs": graphs, "device": device, **reference.options}
     simulator: Simulator = make("simulator", reference.name, target, options, MEMBERS)

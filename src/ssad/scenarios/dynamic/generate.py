@@ -65,7 +65,7 @@ def generator_factory(name: str) -> GeneratorFactory:
     prefix, _, file = name.partition(":")
     if file and prefix in entry_points(group=FILE_GENERATORS).names:
         return cast(GeneratorFactory, resolve("generator_file", {}, prefix)(file))
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     resolved = resolve("generator", GENERATORS, reference.name)
     if not callable(resolved):
         raise ConfigError(f"generator '{name}': expected a class or function (bases, *, seeds, budget)")

@@ -28,10 +28,9 @@ class Corners:
         for base, seed in zip(bases, seeds, strict=True):
             box = ParameterBox.of(base.scenario)
             draw = generator("example corners", seed)
-            corners = [
-                list(map(float, corner)) for corner in product((margin, 1 - margin), repeat=min(box.dimension, 6))
-            ]
-            corners = [corner + [0.5] * (box.dimension - len(corner)) for corner in corners]
+            searched = min(box.dimension, 6)  # a seventh parameter would double the number of corners again
+            rest = [0.5] * (box.dimension - searched)
+            corners = [[*corner, *rest] for corner in product((margin, 1.0 - margin), repeat=searched)]
             order = draw.permutation(len(corners))
             points = [corners[k] for k in order] + draw.random((budget, box.dimension)).tolist()
             self._points.append([box.scenario_at(point) for point in points[:budget]])

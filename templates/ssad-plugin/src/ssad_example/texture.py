@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 from ssad.scenarios.static.physical import TextureAttack
-
 from ssad_example.loss import TopScores
 
 

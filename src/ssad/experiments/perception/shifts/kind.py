@@ -140,7 +140,7 @@ def shifted_scene(shift: str | None, severity: int | str, calibration: Calibrati
 
 def family_of(shift: str) -> str:
     """Return the family of a shift of SSAD; `OWN` for one of a package or of the user."""
-    name = Reference.of(shift).name
+    name = Reference.parse(shift).name
     is_own = name not in KNOWN and (":" in name or registered_names().get(name) == "shift")
     return OWN if is_own else ShiftSpec(shift).family
 

@@ -258,7 +258,7 @@ def make_defence(name: str, **options: Any) -> Defence:
         UnknownNameError: There is no such defence.
         ConfigError: An option is unknown or has an invalid value.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     target = resolve("defence", DEFENCES, reference.name)
     check_arguments("defence", name, target, extra_arguments=options)
     defence: Defence = make(

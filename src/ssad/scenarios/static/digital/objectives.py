@@ -317,7 +317,7 @@ def make_objective(name: str) -> Objective:
         UnknownNameError: There is no such objective.
         ConfigError: An argument is unknown, or the object is no objective.
     """
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     target = OBJECTIVES.get(reference.name) or resolve("loss", LOSSES, reference.name)
     check_arguments("loss", name, target)
     objective: Objective = make(
