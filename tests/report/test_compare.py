@@ -80,7 +80,7 @@ def test_what_one_run_alone_measures_makes_no_cell_unequal_and_equal_runs_have_n
     write_lines(second, lines)
     (found,) = compare_runs([first, second])
     assert (found.both, found.equal) == (40, 40)
-    assert found.findings == ("No difference is larger than chance alone makes.",)
+    assert found.findings == ("No difference is larger than chance explains.",)
 
 
 def test_a_failed_cell_is_no_pair_and_is_named(tmp_path: Path):

@@ -258,7 +258,7 @@ def paired_difference(
 
 
 def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, draws: int = 20_000) -> float:
-    """Test whether first and second differ: how often chance alone makes a mean difference as large.
+    """Test whether first and second differ: how often chance alone gives a mean difference as large.
 
     If they do not, each cluster's difference is as likely to have the other sign. All signs are tried for up to 14
     clusters that differ (for shares with a case a cluster this is McNemar's exact test), else as many as `draws`.
