@@ -24,6 +24,7 @@ from helpers.tiny import make_tiny
 from pydantic import BaseModel
 
 from ssad.core import safeio
+from ssad.core.errors import ConfigError
 from ssad.core.registry import names
 from ssad.experiments.suites import KINDS, kind_of, load_suite
 from ssad.scenarios.static.catalogue import PerturbationEntry
@@ -485,3 +486,31 @@ def test_a_suite_with_the_objects_runs(
     results = ssad.run(suite_file(folder, kind, changes), out=folder / "run", workers=0, quiet=True)
     assert [row.get("reason") for row in results.rows if row["status"] != "ok"] == []
     assert results.report.is_file()
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [
+        ("driving", {"simulator": "embeded"}, r"unknown simulator 'embeded'; closest: embedded"),
+        ("driving", {"simulator": "example-worn-brakes?breaks=1"}, r"simulator '.*': got an unexpected .* 'breaks'"),
+        ("driving", {"scenarios": ["ssad.scenarios.dynamic.knowledge.right_turn:SCENARIO"]}, "brings no scenarios"),
+        ("adversarial", {"generators": ["example-corners?size=1"]}, "generator .* unexpected keyword argument 'size'"),
+        ("detection", {"shifts": ["foggy"]}, "unknown shift 'foggy'; closest: fog"),
+        ("detection", {"shifts": ["helpers.own_perturbations:Wrong"]}, "has no severities: give its class"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "ful"}]}, "unknown loss 'ful'; closest: full"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "example-top?place=1"}]}, "loss .* argument 'place'"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "ssad_example.defence:Grey"}]}, "lacks needs_objects"),
+        ("digital", {"attacks": [{"name": "fgsm", "defence": "jpg"}]}, "unknown defence 'jpg'; closest: jpeg"),
+        (
+            "digital",
+            {"attacks": [{"name": "fgsm", "defence": {"name": "example-grey", "options": {"shade": 1}}}]},
+            "defence .* argument 'shade'",
+        ),
+    ],
+)
+def test_a_wrong_name_or_argument_is_refused_in_one_line(
+    package: Path, folder: Path, kind: str, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words) as error:
+        keys_of(folder, kind, changes, check=True)
+    assert "\n" not in str(error.value)
