@@ -17,10 +17,14 @@ from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pytest
+from helpers.quick import others_slow
+from helpers.sharing import Shared
 from helpers.template import PACKAGE, PROJECT, installed_template
+from helpers.tiny import make_tiny
 from pydantic import BaseModel
 
 from ssad.core import safeio
+from ssad.core.errors import ConfigError
 from ssad.core.registry import names
 from ssad.experiments.suites import KINDS, kind_of, load_suite
 from ssad.scenarios.static.catalogue import PerturbationEntry
@@ -131,6 +135,58 @@ def shuffled(name: str, options: Options) -> dict[str, Any]:
 
 CAR_AHEAD: dict[str, Options] = {"gap": {"scenarios": ["LaneChanging/00"]}}
 """What a light needs: in the loop, a car that it can shine on."""
+
+RUNS: dict[str, dict[str, Any]] = {
+    "driving": {
+        "systems": ["ssad_example.driver:Careful?reach=8@short"],
+        "scenarios": ["ssad_example.scenario:SCENARIO"],
+        "simulator": "example-worn-brakes?brake=0.1",
+    },
+    "adversarial": {
+        "systems": ["example-careful"],
+        "generators": ["ssad_example.generator:Corners?margin=0.2@inner"],
+        "transfer": ["ssad_example.driver:Careful"],
+        "keep": 1,
+    },
+    "how-often": {"systems": ["example-careful?reach=8"], "methods": "auto", "particles": 10, "repeats": 2},
+    "gap": {
+        "systems": [{"name": "s", "detector": "truth", "tracker": "example-nearest", "planner": "example-brake"}],
+        "ceilings": ["example-careful"],
+    },
+    "perception": {
+        "detectors": ["helpers.linear3d:build"],
+        "perturbations": [
+            "ssad_example.shift:Haze",
+            "example-sticker",
+            {"example-steps": {"loss": "example-top", "radius": 5}},
+        ],
+        "data": "TINY",
+    },
+    "detection": {"detectors": ["helpers.linear3d:build"], "shifts": ["example-haze?share=0.15@haze"], "data": "TINY"},
+    "digital": {
+        "detectors": ["helpers.linear3d:build"],
+        "attacks": [
+            {
+                "name": "ssad_example.attack:Steps",
+                "loss": "ssad_example.loss:TopScores?places=5",
+                "defence": {"name": "ssad_example.defence:Grey", "options": {"share": 0.5}},
+                "aware": True,
+            }
+        ],
+        "data": "TINY",
+    },
+    "physical": {
+        "detectors": ["example-smoothed"],
+        "attacks": [{"name": "ssad_example.texture:pale", "settings": {"epochs": 1, "batch": 2}}],
+        "lights": [{"name": "ssad_example.light:Spot", "settings": {"settings": 2, "members": 2}}],
+        "pairs": [{"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 1}],
+        "size": 128,
+        "floor": 0.0,
+    },
+    "tour": {"parts": [{"name": "part", "suite": "COIN ssad_example.kind:Coin"}]},
+    "example-coin": {"kind": "ssad_example.kind:Coin"},
+}
+"""Suites that run with objects of the template. TINY: a data set of one scene."""
 
 Case = tuple[str, Callable[[str, Options], dict[str, Any]]]
 """The kind of object, and the suite that names it with its arguments."""
@@ -407,3 +463,54 @@ def test_a_key_takes_the_object_of_a_package(package: Path, folder: Path, kind: 
     for form, changes in suites.items():
         edited = keys_of(folder, kind, changes)
         assert edited != keys[form], f"the source of {source.name} decides the results, and is in no key ({form})"
+
+
+@pytest.fixture(scope="session")
+def scene(shared: Shared) -> Path:
+    """A data set of one sample: six images of 160 x 90."""
+    return shared("one-sample", lambda out: make_tiny(out, scenes=1, samples=1, sweeps=0, size=(160, 90)))
+
+
+@pytest.mark.parametrize(  # a texture is trained in seconds at best
+    "kind", others_slow(SUITES, [kind for kind in SUITES if kind != "physical"])
+)
+def test_a_suite_with_the_objects_runs(
+    package: Path, folder: Path, scene: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ssad
+
+    monkeypatch.setenv("LINEAR_DATA", str(scene))
+    changes = {key: str(scene) if value == "TINY" else value for key, value in RUNS[kind].items()}
+    if "data" in changes:
+        changes |= {"split": "all", "replicates": 0}
+    results = ssad.run(suite_file(folder, kind, changes), out=folder / "run", workers=0, quiet=True)
+    assert [row.get("reason") for row in results.rows if row["status"] != "ok"] == []
+    assert results.report.is_file()
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [
+        ("driving", {"simulator": "embeded"}, r"unknown simulator 'embeded'; closest: embedded"),
+        ("driving", {"simulator": "example-worn-brakes?breaks=1"}, r"simulator '.*': got an unexpected .* 'breaks'"),
+        ("driving", {"scenarios": ["ssad.scenarios.dynamic.knowledge.right_turn:SCENARIO"]}, "brings no scenarios"),
+        ("adversarial", {"generators": ["example-corners?size=1"]}, "generator .* unexpected keyword argument 'size'"),
+        ("detection", {"shifts": ["foggy"]}, "unknown shift 'foggy'; closest: fog"),
+        ("detection", {"shifts": ["helpers.own_perturbations:Wrong"]}, "has no severities: give its class"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "ful"}]}, "unknown loss 'ful'; closest: full"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "example-top?place=1"}]}, "loss .* argument 'place'"),
+        ("digital", {"attacks": [{"name": "fgsm", "loss": "ssad_example.defence:Grey"}]}, "lacks needs_objects"),
+        ("digital", {"attacks": [{"name": "fgsm", "defence": "jpg"}]}, "unknown defence 'jpg'; closest: jpeg"),
+        (
+            "digital",
+            {"attacks": [{"name": "fgsm", "defence": {"name": "example-grey", "options": {"shade": 1}}}]},
+            "defence .* argument 'shade'",
+        ),
+    ],
+)
+def test_a_wrong_name_or_argument_is_refused_in_one_line(
+    package: Path, folder: Path, kind: str, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words) as error:
+        keys_of(folder, kind, changes, check=True)
+    assert "\n" not in str(error.value)

@@ -28,12 +28,13 @@ def its_tests() -> ModuleType:
     return module
 
 
-GROUPS = ["systems", "perceivers", "trackers", "detectors", "attacks", "generators", "scenarios", "kinds"]
+LISTS = {"physical-attacks": "attacks", "lights": "attacks", "faults": "perturbations"}
+GROUPS = [group.removeprefix("ssad.") for group in PROJECT["entry-points"]]
 
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_its_names_are_listed(group: str) -> None:
-    done = ssad("list", group)
+    done = ssad("list", LISTS.get(group, group))
     assert done.returncode == 0, done.stderr
     listed = [line.split()[0] for line in done.stdout.splitlines()]
     assert set(PROJECT["entry-points"][f"ssad.{group}"]) <= set(listed)

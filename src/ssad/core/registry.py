@@ -19,7 +19,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, unknown_name
+from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, plural, unknown_name
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
 
 def group_of(kind: str) -> str:
     """Return the group of entry points of a kind of object: "system" -> "ssad.systems", "loss" -> "ssad.losses"."""
-    return f"ssad.{kind}{'es' if kind.endswith('s') else 's'}"
+    return f"ssad.{plural(kind)}"
 
 
 def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,7 @@ class WornBrakes(World):
         graphs: Lane graph of each of their towns.
         device: cpu or cuda.
         brake: Share of the brake that is left; in a suite `simulator: example-worn-brakes?brake=0.5`.
-        settings: Further arguments of `World`.
+        assign: Number of the episode of each scene; None: one scene an episode.
     """
 
     def __init__(
@@ -34,9 +33,9 @@ class WornBrakes(World):
         *,
         device: str = "cpu",
         brake: float = 0.3,
-        **settings: Any,
+        assign: npt.ArrayLike | None = None,
     ) -> None:
-        super().__init__(episodes, graphs, device=device, **settings)
+        super().__init__(episodes, graphs, device=device, assign=None if assign is None else np.asarray(assign))
         self.brake = brake
 
     def set_controls(self, controls: npt.ArrayLike) -> None:
