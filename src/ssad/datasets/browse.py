@@ -13,14 +13,14 @@ import jinja2
 import numpy as np
 
 from ssad.core.errors import ConfigError, SSADError
-from ssad.core.images import read_image, save_picture
+from ssad.core.images import save_picture
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import F64, U8
 from ssad.datasets.drawing import draw_edges
 from ssad.datasets.nuscenes.camera_truth import boxes_in_picture
-from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 
@@ -148,7 +148,7 @@ def _write_camera_image(root: Path, frame: SensorFrame, annotations: Annotations
     """A picture with its boxes; one that cannot be read says why."""
     title = frame.channel
     try:
-        image = read_image(root / frame.filename)
+        image = read_frame_image(root, frame)
     except SSADError as error:
         image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
     scale = WIDTH / image.shape[1]
