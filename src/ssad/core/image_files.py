@@ -142,6 +142,8 @@ def decode_image_file(data: bytes, name: str = "<image>") -> ImageFile:
         model = {"1": "grey", "L": "grey", "LA": "grey", "La": "grey", "I": "grey", "CMYK": "CMYK"}.get(
             image_file.mode, "grey" if image_file.mode.startswith("I;16") else "RGB"
         )
+        if file_format == "PNG" and data[25] in (0, 4):  # colour type of the header block; Pillow shows grey as colours
+            model = "grey"
         if file_format == "JPEG" and image_file.mode in ("L", "RGB"):
             # Strict: a file that is cut short raises.
             stored = simplejpeg.decode_jpeg(data, "GRAY" if image_file.mode == "L" else "RGB")
