@@ -169,6 +169,7 @@ def shift_pictures(
         for folder in {task.target.parent for task in tasks}:
             remove_unfinished(folder)
         missing = [task for task in tasks if _task_name(task) not in store.results or not _is_written(task)]
+        failures: dict[str, dict[str, Any]] = {}
         with open_pool(len(missing), workers=workers, ray=ray) as pool:
             for task in missing:
                 pool.add(Task(_shift_file, task, PICTURE_S, label=task))
@@ -178,11 +179,13 @@ def shift_pictures(
                 if record["status"] != "ok":
                     # Whatever lies there is no shifted version of this file.
                     task.target.unlink(missing_ok=True)
-                if _task_name(task) not in store.results:  # else only the file was missing, and its record stands
+                    failures[_task_name(task)] = record
+                # Else only the file was missing, and its record stands, unless the file cannot be made any more.
+                if _task_name(task) not in store.results:
                     store.append({"key": _task_name(task), **record}, None)
                 progress(len(tasks) - len(missing) + finished, len(tasks))
         return [
-            _finish_folder(root, files, settings=identity, condition=condition, results=store.results)
+            _finish_folder(root, files, settings=identity, condition=condition, results={**store.results, **failures})
             for root, condition in conditions.items()
         ]
 
