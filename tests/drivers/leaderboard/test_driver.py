@@ -367,7 +367,8 @@ class Network(AutonomousAgent):
     def run_step(self, input_data, timestamp):
         speed = input_data["speed"][1]["speed"]
         self.steps.append(timestamp)
-        return carla.VehicleControl(throttle=float(self.parts["net"](torch.tensor([speed])).detach()) * (len(self.steps) > 3))
+        throttle = float(self.parts["net"](torch.tensor([speed])).detach())
+        return carla.VehicleControl(throttle=throttle * (len(self.steps) > 3))
 """
 
 
