@@ -75,7 +75,7 @@ LAYOUTS = {
     "yolov5": Layout(3, 5, False, "rgb", 1.0, True, 0.45),
     "yolox": Layout(1, 5, False, "bgr", 255.0, False, 0.65),
 }
-"""By name. YOLO11, YOLOv9, YOLOv5u and Ultralytics' other anchor-free models are laid out as YOLOv8, YOLOv7 as YOLOv5."""
+"""By name. Ultralytics' other anchor-free models (YOLO11, YOLOv5u, ...) are laid out as YOLOv8, YOLOv7 as YOLOv5."""
 TORCHVISION = ("retinanet", "ssd")
 
 
@@ -135,8 +135,9 @@ def onnx_detector(
     outputs = _probe(network, shown)
     names = _read_classes(classes) or class_names(network)
     if layout in TORCHVISION or (layout is None and _is_torchvision(outputs)):
-        options = {"threshold": threshold, "iou": iou, "channels": channels, "scale": scale, "mean": mean, "std": std}
-        return _one_stage(network, outputs, names, shown, layout, input_width, options)
+        preprocessing = {"channels": channels, "scale": scale, "mean": mean, "std": std}
+        options = {"input_width": input_width, "threshold": threshold, "iou": iou, **preprocessing}
+        return _one_stage(network, outputs, names, size=shown, layout=layout, options=options)
     name, strides, output_index = _recognise(network, outputs, shown, layout)
     source = LAYOUTS[name]
     column_count = outputs[output_index].shape[1 if source.transposed else 2] - source.columns
@@ -327,12 +328,13 @@ def _probe(network: OnnxNetwork, size: tuple[int, int]) -> list[Tensor]:
     """
     with torch.no_grad():
         try:
-            return network(torch.full((1, 3, *size), 0.5))
+            outputs: list[Tensor] = network(torch.full((1, 3, *size), 0.5))
         except Exception as error:  # what operators raise for shapes that do not fit
             reason = " ".join(str(error).split())[:150] or type(error).__name__
             raise FormatError(
                 f"{network.path}: it does not run on images of {size[1]} x {size[0]} pixels: {reason}"
             ) from None
+    return outputs
 
 
 def _recognise(
@@ -491,9 +493,9 @@ def _one_stage(
     network: OnnxNetwork,
     outputs: list[Tensor],
     names: Sequence[str] | None,
+    *,
     size: tuple[int, int],
     layout: str | None,
-    input_width: int | None,
     options: dict[str, Any],
 ) -> OnnxOneStage:
     """Build torchvision's detector around exported heads.
@@ -526,12 +528,12 @@ def _one_stage(
     kind = next((kind for kind, count in counts.items() if count == places and layout in (None, kind)), None)
     if kind is None:
         raise FormatError(
-            f"{network.path}: {places} places for images of {size[1]} x {size[0]} pixels; torchvision's SSD (300 or 320 "
-            f"pixels) and RetinaNet have {' or '.join(str(count) for count in counts.values())}"
+            f"{network.path}: {places} places for images of {size[1]} x {size[0]} pixels; torchvision's SSD (300 or "
+            f"320 pixels) and RetinaNet have {' or '.join(str(count) for count in counts.values())}"
         )
     classes, class_columns = _columns(network, kind, names, columns)
-    with torch.device("cpu"):
-        model = _retinanet(network, columns, input_width) if kind == "retinanet" else _ssd(network, columns, size[0])
+    is_ssd = kind == "ssd"
+    model = _ssd(columns, size[0]) if is_ssd else _retinanet(network, columns, options["input_width"])
     transform: Any = model.transform
     scale = 1.0 if options["scale"] is None else float(options["scale"])
     if network.normalises:
@@ -609,7 +611,7 @@ def _retinanet(network: OnnxNetwork, columns: int, input_width: int | None) -> A
     return model
 
 
-def _ssd(network: OnnxNetwork, columns: int, side: int) -> Any:
+def _ssd(columns: int, side: int) -> Any:
     """Return torchvision's SSD300 or SSDlite320 without network."""
     if side == 300:
         ratios = [[2], [2, 3], [2, 3], [2, 3], [2], [2]]

@@ -1,7 +1,7 @@
 """Networks in ONNX files as modules of PyTorch, with gradients: read, checked, rewritten for onnx2torch, and run.
 
-A file is data: nothing in it runs but the operators of ONNX that onnx2torch knows. Weights beside it are read from files
-of its own folder only.
+A file is data: nothing in it runs but the operators of ONNX that onnx2torch knows. Weights beside it are read from
+its own folder only.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class OnnxNetwork(nn.Module):
         if self.batch is None or self.batch == len(images):
             return self._run(images)
         parts = []
-        for part in images.split(self.batch):
+        for part in torch.split(images, self.batch):
             missing = self.batch - len(part)
             filled = torch.cat((part, part[-1:].detach().expand(missing, -1, -1, -1))) if missing else part
             parts.append([output[: len(part)] for output in self._run(filled)])
@@ -197,7 +197,7 @@ def _check_input(onnx: Any, model: Any, path: Path) -> None:
 
 
 def _remove_copies(onnx: Any, model: Any) -> None:
-    """Let the readers of a copy read the original, and keep constants with the weights, where onnx2torch looks for them."""
+    """Let the readers of a copy read the original, and move constants to the weights, where onnx2torch finds them."""
     outputs = {output.name for output in model.graph.output}
     originals: dict[str, str] = {}
     nodes = []

@@ -1,4 +1,4 @@
-"""Target assignment by task alignment (Feng et al. 2021, TOOD, section 3.2), for heads without training targets of ours.
+"""Target assignment by task alignment (Feng et al. 2021, TOOD, section 3.2).
 
 Boxes are in pixels of the network's own input. Nothing here is differentiable.
 """
@@ -30,8 +30,8 @@ def assign_by_alignment(
         targets: Objects of all images.
 
     Returns:
-        Label [B, P] (-1 background, -2 ignored), owner [B, P] (-1 none), box of the owner [B, P, 4] (0 without one), and
-        target score [B, P].
+        Label [B, P] (-1 background, -2 ignored), owner [B, P] (-1 none), box of the owner [B, P, 4] (0 without one),
+        and target score [B, P].
     """
     rows = [
         _assign_image(image_score, image_box, place, targets, index)
