@@ -58,7 +58,7 @@ class DigitalSuite(DetectorSuite, AttackTable):
     hardened: list[str] = Field(default=[])
 
     def loss_of(self, method: Method) -> str:
-        """Return the loss of an attack; without one of its own, `vanish` beside exports, which have no training loss."""
+        """Return the loss of an attack: `vanish` in place of the training loss beside exports, which have none."""
         loss = super().loss_of(method)
         has_export = any(name.startswith(ONNX) for name in (*self.detectors, *self.hardened, *self.transfer_detectors))
         return "vanish" if has_export and not method.loss and loss == "full" else loss
