@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.options import Device
 from ssad.core.errors import ConfigError
 
@@ -36,6 +37,8 @@ def detect(
 
     OUT/results.json is the results file of the official nuScenes detection task, which `ssad score` reads too.
     """
+    paths.check_exists(*sources, weights)
+    paths.check_out(out, paths.DETECTIONS, option="OUT")
     from rich.console import Console
 
     from ssad.core.machine import pick_device
@@ -91,6 +94,8 @@ def show(
     samples: Annotated[int, typer.Option(min=1, help="Moments of each scene, spread over it.")] = 3,
 ) -> None:
     """Write a page to look at a data set: pictures with their boxes, and the LiDAR from above."""
+    paths.check_exists(root)
+    paths.check_out(out, paths.PAGE, option="OUT")
     from rich.console import Console
 
     from ssad.datasets.browse import check_scenes, write_page

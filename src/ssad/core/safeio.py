@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.folders import check_links_above
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -430,9 +431,10 @@ def make_folder(path: str | Path) -> Path:
     """Create a folder with its parents, and check that it is writable.
 
     Raises:
-        StoreError: It cannot be created or written to.
+        StoreError: It cannot be created or written to, or a link below a results folder leads to it.
     """
     folder = Path(path)
+    check_links_above(folder, itself=True)
     probe = _temporary(folder / "probe")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -456,9 +458,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` (same suffix) that replaces it if the block succeeds.
 
     Raises:
-        StoreError: The file cannot be written.
+        StoreError: The file cannot be written, or a link below a results folder leads to it.
     """
     target = Path(path)
+    check_links_above(target)
     temporary = _temporary(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

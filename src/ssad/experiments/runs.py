@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError, StoreError
+from ssad.core.folders import check_tree
 from ssad.engine.kind import Kind, Plan, Replay
 from ssad.engine.replay import replay_cell
 from ssad.engine.run import run_json
@@ -29,8 +30,10 @@ def read_plan(folder: str | Path) -> Plan:
 
     Raises:
         ConfigError: Code or inputs have changed since.
+        StoreError: The folder holds no run, or something in it leads out of it.
     """
     header = read_run(folder)
+    check_tree(folder)
     try:
         kind = kind_of(str(header["suite"]["kind"]))
         suite, device = kind.suite.model_validate(header["suite"]), str(header["versions"]["device"])

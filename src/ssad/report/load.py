@@ -14,6 +14,7 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_tree
 from ssad.core.run_records import RESULTS, read_records
 
 INCIDENTAL = (
@@ -122,12 +123,13 @@ def load_run(folder: Path | str) -> Run:
     A folder whose lines have no seals, such as one of an earlier version, is read with a warning.
 
     Raises:
-        StoreError: The folder does not hold a run, the run has no result yet, or its records fail a check of
-            `ssad.core.run_records.read_records`.
+        StoreError: The folder does not hold a run, something in it leads out of it, the run has no result yet, or its
+            records fail a check of `ssad.core.run_records.read_records`.
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
+    check_tree(folder)
     header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
     if not isinstance(header, dict):
         raise StoreError(f"{folder / 'run.json'}: not written by ssad run; give a folder written by: ssad run")
