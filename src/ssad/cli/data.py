@@ -139,7 +139,7 @@ def score(
 
     A shifted folder is first checked against its manifest, so that clean data cannot be scored as shifted.
     """
-    paths.check_exists(results, dataroot / version)
+    paths.check_exists(dataroot / version, results)
     from rich.console import Console
 
     from ssad.cli.shift import checked

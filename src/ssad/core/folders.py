@@ -92,6 +92,11 @@ def open_inside(root: str | Path, relative: str | Path, flags: int) -> int:
     return descriptor
 
 
+def is_file_name(text: str) -> bool:
+    """Return whether a name from a file, such as that of a scene, can be part of a file's name in any folder."""
+    return 0 < len(text) <= 200 and text not in (".", "..") and not set(text) & set("/\\\0")
+
+
 def check_links_above(path: str | Path, *, root: str | Path | None = None, itself: bool = False) -> None:
     """Check that no folder between a root and a file is a symbolic link, so that a write stays inside.
 
@@ -150,7 +155,7 @@ def check_output_folder(folder: str | Path, patterns: Sequence[str], *, option: 
             return
         if not path.is_dir():
             raise StoreError(f"{path}: cannot write there: it is a file; choose a folder with {option}")
-        is_empty = all(name in UNOBTRUSIVE or name.endswith(".tmp") for name in os.listdir(path))
+        is_empty = all(name in UNOBTRUSIVE or (name[0] == "." and ".tmp" in name) for name in os.listdir(path))
         if not is_empty and not any(next(path.glob(pattern), None) for pattern in patterns):
             raise StoreError(f"{path}: holds something else; choose a new or empty folder with {option}")
     except OSError as error:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_links_above, open_inside
 from ssad.core.frames import ShiftReport
 from ssad.core.images import encode_jpeg
 from ssad.core.machine import start_warp_quietly
@@ -24,6 +25,7 @@ from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.tables import BROKEN
 from ssad.recorders.shifted.manifest import (
     FOLDER,
     STATES,
@@ -64,7 +66,7 @@ def read_finished_labels(root: Path, scene: str) -> SceneLabels | None:
         encoded = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
         labels = msgspec.json.decode(encoded, type=SceneLabels)
         return labels if labels.lines == digest_file(shard_path(root, scene)) else None
-    except (FormatError, msgspec.MsgspecError):
+    except (FormatError, *BROKEN):
         return None  # missing or damaged: the scene is checked again
 
 
@@ -148,11 +150,10 @@ def check_folders(root: Path, folders: Iterable[str | Path], source: Path) -> No
 @contextlib.contextmanager
 def _open_for_append(path: Path) -> Iterator[RawIOBase]:
     """Open a file to append whole lines; it is on disk when the block ends."""
-    try:
-        stream = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
-    except OSError as error:
-        raise _write_error(path, error) from None
-    with stream:
+    descriptor = open_inside(
+        path.parent.parent, f"{path.parent.name}/{path.name}", os.O_WRONLY | os.O_APPEND | os.O_CREAT
+    )
+    with open(descriptor, "ab", buffering=0) as stream:
         if stream.tell():
             _append(path, stream, None)  # ends a line that a kill may have truncated
         yield stream
@@ -332,6 +333,8 @@ def _write(root: Path, target: Path, data: bytes) -> None:
 def _replacement_path(root: Path, target: Path) -> Iterator[Path]:
     """Yield a path in the folder of unfinished files that replaces `target` if the block succeeds. StoreError."""
     temporary = _temporary(root)
+    check_links_above(target, root=root)
+    check_links_above(temporary, root=root)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.parent.mkdir(exist_ok=True)
