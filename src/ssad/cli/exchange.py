@@ -29,7 +29,7 @@ def export_texture(
     from ssad.engine.store import read_run
 
     read_run(folder)
-    paths.check_out(out, paths.EXPORT, option="OUT")
+    paths.check_out(out, paths.EXPORTED_TEXTURE, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
@@ -49,7 +49,7 @@ def export_light(
     from ssad.engine.store import read_run
 
     read_run(folder)
-    paths.check_out(out, paths.EXPORT, option="OUT")
+    paths.check_out(out, paths.EXPORTED_LIGHT, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 

@@ -61,7 +61,7 @@ def export_scenarios(
 
     The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
     """
-    paths.check_out(out, paths.EXPORT, option="OUT")
+    paths.check_out(out, paths.EXPORTED_SCENARIOS, option="OUT")
     from ssad.interchange.export import export_commonroad, export_openscenario
     from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios

@@ -14,13 +14,15 @@ from ssad.core.folders import RECORDING_FILE, RUN_FILE, check_output_folder
 
 RUN = (RUN_FILE,)
 COMPARISON = (RUN_FILE, "compare.html")
-REPLAYS = ("*.npz", "*.jpg")
+REPLAYS = ("[0-9a-f]" * 12 + "*.npz", "[0-9a-f]" * 12 + "*.jpg")
 TRAINING = ("log.jsonl", "last.pt")
 RECORDING = (RECORDING_FILE,)
 SHIFTED = (RUN_FILE, "*/manifest/identity.json")
 DETECTIONS = ("detections.json", "results.json")
 PAGE = ("pictures",)
-EXPORT = ("*.xosc", "*.xodr", "*.xml", "scenarios.json", "texture.json", "light.json")
+EXPORTED_SCENARIOS = ("*.xosc", "*.xml", "scenarios.json")
+EXPORTED_TEXTURE = ("texture.json",)
+EXPORTED_LIGHT = ("light.json",)
 """Names of what a command writes, by which it knows its own folder."""
 
 NAMED_FILE = re.compile(r"(?:[^\s,\[\]{}'\"=]*:)?([^\s,\[\]{}'\"=:?*]+\.(?:yaml|yml|safetensors|py|xodr|xosc|onnx))\b")

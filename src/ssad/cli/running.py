@@ -27,7 +27,7 @@ def run(
     suite: Annotated[
         str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
     ],
-    out: Annotated[Path | None, typer.Option(help="Results folder.  [default: runs/SUITE]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the suite; can be repeated."),
@@ -59,7 +59,7 @@ def run(
     Exit code 0: every cell ran. 1: some cells failed; the results give the reasons. 2: invalid input.
     """
     if not (print_config or dry_run):
-        paths.check_out(out, paths.RUN)
+        paths.check_out(out or Path("runs") / Path(suite).stem, paths.RUN)
     paths.check_named_files(suite, settings or [])
     from rich.console import Console
 

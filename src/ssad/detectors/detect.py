@@ -115,7 +115,8 @@ def detect_images(
     duplicate = next((name for name in names if names.count(name) > 1), None)
     if duplicate is not None:
         raise ConfigError(f"two pictures are called {duplicate}; give them to two commands with two OUT folders")
-    make_folder(out)
+    # First, so that the folder of a stopped command is known as its own.
+    write_atomic(make_folder(out) / "detections.json", "{}\n")
     annotated_images, rows_by_file = [], {}
     for file in files:
         loaded = as_images(file)
