@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.registry import Reference, split_weights
 from ssad.core.schema import Names, Schema
-from ssad.core.source import source_version
+from ssad.core.source import plugin_version
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
@@ -122,8 +122,8 @@ def detectors_of(
         for class_name in target_classes:
             if class_name not in detector.classes:
                 raise ConfigError(f"suite {suite}: {name} has no class {class_name}, which wears a texture or light")
-        user_source = f" {source_version(detector_name.partition(':')[0])}" if ":" in detector_name else ""
-        victims.weights[name], victims.files[name] = state_hash(detector) + user_source, path
+        versions = (state_hash(detector), plugin_version("detector", DETECTORS, detector_name))
+        victims.weights[name], victims.files[name] = " ".join(filter(None, versions)), path
         victims.tasks[name] = task
     return victims
 

@@ -24,8 +24,8 @@ from ssad.recorders.shifted.manifest import (
     PAGE,
     TABLE,
     ManifestCounts,
+    build_manifest,
     digest_file,
-    page,
     read_lines,
     shard_path,
 )
@@ -189,7 +189,7 @@ def _finish_root(
     shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     if not counts.reasons:
         identity = Shard(options, shift, severity, "").identity()
-        manifest = page(identity, source, counts, labels=options.labels, transformed=transformed)
+        manifest = build_manifest(identity, source, counts, labels=options.labels, transformed=transformed)
         safeio.write_atomic(root / PAGE, safeio.dump_json(manifest, indent=1) + "\n")
     states = counts.states
     return ShiftedRoot(

@@ -25,7 +25,7 @@ from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.scenarios.static.digital import Attack, AttackResult, Budget, make_objective, px, run_attack
 from ssad.scenarios.static.digital.budget import LEVELS
 from ssad.scenarios.static.digital.chosen_object import chosen_first
-from ssad.scenarios.static.digital.defences import RandomResize
+from ssad.scenarios.static.digital.defences import RandomDefence
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.reference_ensemble import compare_with_references, is_judged
@@ -80,7 +80,7 @@ class SceneAttacker:
     def _with_draws(self, attack: Attack) -> Attack:
         """Return the attack, made to know the random defence of the detector if the spec says so."""
         defence = getattr(self.watched.detector, "defence", None)
-        if self.spec.draws and isinstance(defence, RandomResize):
+        if self.spec.draws and isinstance(defence, RandomDefence):
             return Expected(attack, defence, self.spec.draws)
         return attack
 
