@@ -131,11 +131,14 @@ def summary(folders: dict[str, list[Result]]) -> str:
             missing = int(np.isnan(result.distance).sum())
             worst = float(np.nanmax(result.distance, initial=0.0))
             if missing or worst > CLOSE:
-                where = result.places[int(np.nanargmax(result.distance))] if worst > CLOSE else ""
-                away = f"{int((result.distance > CLOSE).sum())} of {len(result.distance)} samples up to {worst:.2f} m away ({where})"
-                lines.append(
-                    f"* {name}, {result.path.name}: {away if worst > CLOSE else ''}{', ' if missing and worst > CLOSE else ''}{f'{missing} samples that it lacks' if missing else ''}"
-                )
+                remarks = []
+                if worst > CLOSE:
+                    where = result.places[int(np.nanargmax(result.distance))]
+                    away = int((result.distance > CLOSE).sum())
+                    remarks.append(f"{away} of {len(result.distance)} samples up to {worst:.2f} m away ({where})")
+                if missing:
+                    remarks.append(f"{missing} samples that it lacks")
+                lines.append(f"* {name}, {result.path.name}: {', '.join(remarks)}")
     return "\n".join(lines) + "\n"
 
 

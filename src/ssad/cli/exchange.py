@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.importing import check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
@@ -26,6 +27,10 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_TEXTURE, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
@@ -42,6 +47,10 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and the picture that a projector shows."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_LIGHT, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
