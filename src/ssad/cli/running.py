@@ -27,7 +27,9 @@ def run(
     suite: Annotated[
         str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
     ],
-    out: Annotated[Path | None, typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the suite; can be repeated."),
