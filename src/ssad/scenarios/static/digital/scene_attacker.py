@@ -16,10 +16,10 @@ from torch import Tensor
 
 from ssad.core.detections import Truth, to_images
 from ssad.core.errors import ConfigError
-from ssad.core.images import read_image
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import camera_truth
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.scenarios.static.digital import Attack, AttackResult, Budget, make_objective, px, run_attack
@@ -109,7 +109,7 @@ class SceneAttacker:
         return images
 
     def _read(self, frame: SensorFrame) -> U8:
-        return read_image(self.recorded.root / frame.filename)
+        return read_frame_image(self.recorded.root, frame)
 
     def _truth(self, frame: SensorFrame, scene: SceneData | None = None) -> Truth:
         """Return the truth of a frame, with the labels of the attacked detector; other classes are left out.
