@@ -515,6 +515,30 @@ def _read_report(folder: Path) -> object:
     return write_report(folder), check_artefacts(folder), summary(folder), report_markdown([folder])
 
 
+def _two_runs(folder: Path) -> Sequence[Path]:
+    paths = _unsealed_run(folder / "first")
+    _run(folder / "second")
+    return paths
+
+
+def _read_comparison(folder: Path) -> object:
+    from ssad.report.compare import write_comparison
+
+    return write_comparison([folder / "first", folder / "second"], folder / "out", [])
+
+
+def _drive(folder: Path) -> Sequence[Path]:
+    return _nuscenes(folder, samples=6)
+
+
+def _read_drive(folder: Path) -> object:
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.interchange.drive_log import scenario_of_drive
+
+    with NuScenes(folder) as data:
+        return scenario_of_drive(data, data.scenes()[0].name if data.scenes() else "none", town="a")
+
+
 def _trace(folder: Path) -> Sequence[Path]:
     from helpers.metric_traces import make_trace
 
@@ -574,10 +598,10 @@ def _read_checkpoint(folder: Path) -> object:
     return [load_weights(path) for path in sorted(folder.glob("*.pth"))]
 
 
-def _nuscenes(folder: Path) -> Sequence[Path]:
+def _nuscenes(folder: Path, *, samples: int = 2) -> Sequence[Path]:
     from helpers.tiny import make_tiny
 
-    make_tiny(folder, scenes=1, samples=2, size=(64, 36))
+    make_tiny(folder, scenes=1, samples=samples, size=(64, 36))
     return sorted(folder.glob("v1.0-*/*.json"))
 
 
@@ -750,10 +774,12 @@ READERS: dict[str, Reader] = {
     "run": Reader(_run, _read_run),
     "unsealed-run": Reader(_unsealed_run, _read_run),
     "report": Reader(_unsealed_run, _read_report),
+    "compare": Reader(_two_runs, _read_comparison),
     "trace": Reader(_trace, _read_trace),
     "policy": Reader(_policy, _read_policy),
     "checkpoint": Reader(_checkpoint, _read_checkpoint, is_single=True),
     "nuscenes": Reader(_nuscenes, _read_nuscenes),
+    "drive": Reader(_drive, _read_drive),
     "results": Reader(_results, _read_results),
     "coco": Reader(_coco, _read_coco),
     "points": Reader(_points, _read_points, is_single=True),

@@ -141,6 +141,12 @@ def test_wrong_paths_are_found_before_heavy_packages_load(tmp_path: Path) -> Non
         "export texture none x out",
         "export light none x out",
         "export RightTurn/00 full --format openscenario",
+        "import map none.xodr",
+        "import routes none",
+        "import openscenario none.xosc out.yaml",
+        "import leaderboard none.xml out.yaml",
+        "import commonroad none.xml out.yaml",
+        "import drive none out.yaml --scene a",
     )
     script = NO_HEAVY_PACKAGE.format(commands=commands)
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
