@@ -86,6 +86,7 @@ def import_openscenario(
     ] = None,
 ) -> None:
     """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    paths.check_exists(file)
     from ssad.interchange.openscenario_reader import read_openscenario
     from ssad.scenarios.dynamic import save_scenarios
 
@@ -105,6 +106,7 @@ def import_leaderboard(
 
     Their towns must be imported before they are driven.
     """
+    paths.check_exists(file)
     from ssad.interchange.leaderboard import read_leaderboard
     from ssad.scenarios.dynamic import save_scenarios
 
@@ -128,6 +130,7 @@ def import_commonroad(
 
     Lanelets that are no town's yet are stored as a town beside OUT.yaml too.
     """
+    paths.check_exists(file)
     from ssad.interchange.commonroad_reader import read_commonroad
     from ssad.scenarios.dynamic import save_scenarios
 
