@@ -179,8 +179,13 @@ def test_places_are_the_cells_of_each_level(exported: Callable[..., Path]) -> No
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_gradients_agree_with_finite_differences(layout: str, exported: Callable[..., Path]) -> None:
-    detector = copy.deepcopy(make_detector(f"onnx:{exported(layout)}")).double()
+def test_gradients_agree_with_finite_differences(layout: str, exported: Callable[..., Path], tmp_path: Path) -> None:
+    model = onnx.load(str(exported(layout)))
+    for part in model.graph.node:  # exporters write casts from float32 to float32, which double() must pass
+        part.input[:] = ["cast" if name == "images" else name for name in part.input]
+    model.graph.node.insert(0, node("Cast", "images", output="cast", to=onnx.TensorProto.FLOAT))
+    onnx.save(model, str(tmp_path / "a.onnx"))
+    detector = copy.deepcopy(make_detector(f"onnx:{tmp_path / 'a.onnx'}")).double()
     images = pictures(1, (50, 90)).double().requires_grad_()
 
     def value(images: Tensor) -> Tensor:
