@@ -130,7 +130,12 @@ def packages_of(extra: str) -> list[str]:
     return [package_name.strip() for package_name, _, marker in requirements if extra_marker.search(marker)]
 
 
-EXTRA_OF = {"torch": "perception", "torchvision": "perception", "scenic": "scenic"}
+EXTRA_OF = {
+    "torch": "perception",
+    "torchvision": "perception",
+    "scenic": "scenic",
+    "commonroad": "commonroad",
+}
 """Package that is imported where it is needed -> the extra that brings it."""
 
 
