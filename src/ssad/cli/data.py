@@ -93,7 +93,13 @@ def shift(
                 severity=severity,
                 workers=workers,
                 ray=ray,
-                settings={"seed": seed, "calibration": calibration, "quality": quality, "subsampling": subsampling},
+                settings={
+                    "seed": seed,
+                    "calibration": calibration,
+                    "quality": quality,
+                    "subsampling": subsampling,
+                    "lidar": lidar,
+                },
             )
         )
     code = shift_folder(

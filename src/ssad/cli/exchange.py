@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Annotated
@@ -54,17 +55,42 @@ def import_map(
         Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
     ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Refuse a file with anything doubtful.")] = False,
+    turn_on_red: Annotated[
+        bool | None,
+        typer.Option(
+            "--turn-on-red/--no-turn-on-red",
+            help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
+        ),
+    ] = None,
 ) -> None:
-    """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
+    """Import an OpenDRIVE map (1.4 to 1.8) as a town; say what came in, what was left out, and what is doubtful.
+
+    A page with this report and a picture from above is written too.
+    """
+    from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
+    from ssad.world.roads.import_page import import_page_path
 
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
-    path = bake(file, town_name, home_folder())
+    report = ImportReport(str(file))
+    path = bake(
+        file,
+        town_name,
+        home_folder(),
+        report=report,
+        strict=strict,
+        turn_on_red=turn_on_red,
+        progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
+    )
     print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
+    for line in report.lines():
+        print(line)
+    print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 
 
 def import_routes(

@@ -81,9 +81,17 @@ LISTED = (
     "perturbation",
     "shift",
     "attack",
+    "loss",
+    "defence",
+    "simulator",
     "town",
 )
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
+
+
+def plural(noun: str) -> str:
+    """Return the plural of a noun: "system" -> "systems", "loss" -> "losses"."""
+    return f"{noun}es" if noun.endswith("s") else f"{noun}s"
 
 
 def unknown_name(kind: str, name: str, known_names: Iterable[str]) -> UnknownNameError:
@@ -100,7 +108,7 @@ def unknown_name(kind: str, name: str, known_names: Iterable[str]) -> UnknownNam
     names = sorted(known_names)
     close_matches = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
     hint = f"; closest: {', '.join(close_matches)}" if close_matches else ""
-    all_names = f"see: ssad list {kind}s" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
+    all_names = f"see: ssad list {plural(kind)}" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
     return UnknownNameError(f"unknown {kind} '{name}'{hint} ({all_names})")
 
 
@@ -135,6 +143,8 @@ EXTRA_OF = {
     "torchvision": "perception",
     "scenic": "scenic",
     "commonroad": "commonroad",
+    "onnx": "onnx",
+    "onnx2torch": "onnx",
 }
 """Package that is imported where it is needed -> the extra that brings it."""
 

@@ -33,8 +33,8 @@ class ScenarioSuite(SuiteBase):
     """Keys of suites that drive scenarios.
 
     Attributes:
-        scenarios: Arguments of `load_scenarios` (sets, types, names, YAML files), or highway-env: that simulator's
-            intersection and highway.
+        scenarios: Arguments of `load_scenarios` (sets, classes, module:object, names, YAML files), or highway-env:
+            that simulator's intersection and highway.
         cluster: What is drawn independently of one another, for the intervals: towns' routes, each of which may have
             several scenarios, or scenarios.
     """

@@ -123,19 +123,21 @@ class Loop:
         """
         simulator = self.simulator
         simulator.reset(scenes, episodes=episodes)
-        started = np.full(simulator.batch, scenes is None)
+        is_started = np.full(simulator.batch, scenes is None)
         if scenes is not None:
-            started[np.asarray(scenes)] = True
+            is_started[np.asarray(scenes)] = True
         for policy, (target, driver) in enumerate(self.drivers):
             if isinstance(target, int):
-                self._seat(policy, (np.arange(simulator.agents) == target) & started[:, None])
+                self._assign_policy(policy, (np.arange(simulator.agents) == target) & is_started[:, None])
             if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
-                assigned = [simulator.episodes[episode_index] for episode_index in simulator.assigned]
+                episodes_by_scene = [simulator.episodes[episode_index] for episode_index in simulator.assigned]
                 if seeds is not None:
-                    assigned = [replace(episode, seed=seed) for episode, seed in zip(assigned, seeds, strict=True)]
-                driver.reset(assigned)
+                    episodes_by_scene = [
+                        replace(episode, seed=seed) for episode, seed in zip(episodes_by_scene, seeds, strict=True)
+                    ]
+                driver.reset(episodes_by_scene)
 
-    def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
+    def _assign_policy(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
         driver = self.drivers[policy][1]
         speed = getattr(driver, "target_speed", None)
         self.simulator.take(mask, driver.controller, policy=policy, target_speed=speed)
@@ -176,7 +178,7 @@ class Loop:
                     if (current & ~selected).any():
                         self.simulator.take(current & ~selected, None)
                     if (selected & ~current).any():
-                        self._seat(policy, selected & ~current)
+                        self._assign_policy(policy, selected & ~current)
                     state = self.simulator.state()
                 agents = np.argwhere(selected).astype(np.int32)
             if external and agents is not None and len(agents):

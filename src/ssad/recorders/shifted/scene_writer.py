@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from io import RawIOBase
 from pathlib import Path
 from typing import Any, Final
@@ -16,14 +17,15 @@ import numpy as np
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.frames import ShiftReport
-from ssad.core.images import encode_jpeg
+from ssad.core.image_files import check_writable, encode_like, turn_upright
+from ssad.core.images import annotation_orientation
 from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import LIDAR
-from ssad.core.types import U8
-from ssad.datasets.nuscenes.files import points_bytes
+from ssad.datasets.nuscenes.files import read_frame_file
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.point_files import encode_points_like, read_point_file
 from ssad.recorders.shifted.manifest import (
     FOLDER,
     STATES,
@@ -224,12 +226,21 @@ def _unchanged_reason(shifter: SceneShifter, frame: SensorFrame) -> str:
 
 def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
-    clean_image = shifter.read(frame)
+    image_file, clean_image = read_frame_file(shifter.root, frame)
+    check_writable(image_file)
     image, applied = shifter.image(frame, clean=clean_image)
     if not applied.applied or np.array_equal(image, clean_image):
         return None, "", applied
     image = np.ascontiguousarray(image)
-    return _encode(image, shard, frame.filename), digest_bytes(image.data), applied
+    orientation = annotation_orientation(image_file, width=frame.width, height=frame.height)
+    encoded = encode_like(
+        image_file,
+        turn_upright(image, orientation),
+        quality=shard.options.quality,
+        subsampling=shard.subsampling,
+        compression=1,
+    )
+    return encoded, digest_bytes(image.data), applied
 
 
 def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
@@ -237,7 +248,10 @@ def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[by
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):
         return None, "", applied
-    encoded = points_bytes(points)
+    point_file = read_point_file(shifter.root / frame.filename)
+    if point_file.dropped_fields:
+        applied = replace(applied, details={**applied.details, "dropped_fields": list(point_file.dropped_fields)})
+    encoded = encode_points_like(point_file, points)
     return encoded, digest_bytes(encoded), applied
 
 
@@ -268,18 +282,6 @@ def _failed_line(shard: Shard, record: dict[str, Any], message: str) -> dict[str
     """Return the manifest line of a file that cannot be made, and remove any older version of it."""
     _remove(shard.root / record["file"])
     return record | {"state": "failed", "reason": message.replace(f"{shard.options.source}{os.sep}", "")}
-
-
-def _encode(image: U8, shard: Shard, name: str) -> bytes:
-    """Encode an image in the format of the original file."""
-    if name.lower().endswith(".png"):
-        succeeded, encoded = cv2.imencode(
-            ".png", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1]
-        )
-        if not succeeded:
-            raise FormatError(f"{name}: cannot be encoded as PNG")
-        return encoded.tobytes()
-    return encode_jpeg(image, shard.options.quality, shard.subsampling)
 
 
 def _link(shard: Shard, record: dict[str, Any], *, is_required: bool = True) -> dict[str, Any]:

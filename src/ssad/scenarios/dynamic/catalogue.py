@@ -30,6 +30,9 @@ FREE_DRIVE = "FreeDrive"
 CUSTOM = "Custom"
 """The type whose scenarios list their actors themselves."""
 
+TYPES: dict[str, str] = {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}
+"""All built-in types of scenarios."""
+
 
 def scenario_type(name: str) -> ScenarioType:
     """Return the scenario class with a name.
@@ -44,7 +47,7 @@ def scenario_type(name: str) -> ScenarioType:
         UnknownNameError: No class has that name; the message lists the closest ones.
         ConfigError: A user module fails to import, or the name refers to another object.
     """
-    resolved = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
+    resolved = resolve("scenario", TYPES, name)
     if not isinstance(resolved, ScenarioType):
         raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(resolved).__name__}")
     return resolved

@@ -135,7 +135,7 @@ def test_cells_are_the_clean_data_and_each_shift_and_severity() -> None:
     clean, fog = plan.cells[:2]
     assert clean.fields == {"detector": "one", "shift": None, "family": "clean", "severity": 0}
     assert fog.fields == {"detector": "one", "shift": "fog", "family": SHIFTS["fog"][0], "severity": 1}
-    assert fog.spec == {"calibration": "physical", "labels": "original"}
+    assert fog.spec == {"calibration": "physical", "labels": "original", "shift": "fog"}
     assert (fog.seed, fog.system) == (4, "one")
     assert plan.versions == {"shifts": str(VERSIONS["physical"])}
     assert plan.details == {"one": "one.pth", "two": "two.pth"}
