@@ -101,6 +101,7 @@ class _NamedDriver:
         self.name = name
         self.controller = controller
         self.target_speed: float | None = getattr(system, "target_speed", None)
+        self.period: float = getattr(system, "period", 0.1)
         self.version: str = getattr(system, "version", "")
         self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ from ssad.drivers.leaderboard.carla_types import RoadOption
 from ssad.drivers.leaderboard.driver import _global_plan
 from ssad.drivers.leaderboard.sensors import geolocation
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.simulators.closed_loop import onboard_sensors
+from ssad.simulators.closed_loop import drive, onboard_sensors, scenario_json
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -458,6 +461,50 @@ def test_lidar_and_radar(tmp_path: Path) -> None:
     assert stands[:, 3] == pytest.approx(-v * np.cos(stands[:, 1]) * np.cos(stands[:, 2]), abs=0.05)
     assert len(comes) > 2, speeds
     assert comes[:, 3] == pytest.approx((-v - 7.0) * np.cos(comes[:, 1]) * np.cos(comes[:, 2]), abs=0.15)
+
+
+@dataclass(frozen=True)
+class Request:
+    """Request for an episode, as plain data."""
+
+    key: str
+    system: str
+    seed: int
+    spec: Mapping[str, Any]
+
+
+def test_agents_are_asked_twenty_times_a_second(tmp_path: Path) -> None:
+    """With half a turn of the LiDAR each time, right and left by turns; the trace has steps of 0.1 s."""
+    path = tmp_path / "often.py"
+    text = AGENT.replace("return [{", f"return {EYES[:1]} + [{{")
+    step = "def run_step(self, input_data, timestamp):\n        "
+    record = "self.seen = getattr(self, 'seen', []) + [(timestamp, input_data['lidar'])]\n        "
+    path.write_text(text.replace(step, step + record))
+    scenario = load_scenarios("StraightObstacle/00")[0]
+    spec = {"repetition": 0, "spread": 0.0}
+    requests = [
+        Request(
+            str(steps), f"leaderboard:{path}", 0, spec | {"scenario": scenario_json(replace(scenario, limits=limits))}
+        )
+        for steps, limits in ((4, EpisodeLimits(max_steps=4)), (6, EpisodeLimits(max_time=0.6)))
+    ]
+    system = make_system(f"leaderboard:{path}")
+    _, traces, _ = drive(requests, device="cpu", driver=system)
+    assert [trace.dt for trace in traces] == [0.1, 0.1]
+    assert [len(trace.x) for trace in traces] == [5, 7]
+    assert [trace.end for trace in traces] == ["max_steps", "max_time"]
+    for agent, count in zip(system.act.__self__._agents, (8, 12), strict=True):
+        times = [time for time, _ in agent.seen]
+        assert times == pytest.approx(np.arange(count) / 20)
+        assert [number for _, (number, _) in agent.seen] == list(range(count))
+        for number, (_, (_, points)) in enumerate(agent.seen):
+            side = -1.0 if number % 2 == 0 else 1.0
+            assert len(points) > 5_000
+            assert (side * points[:, 1] >= -1e-3).all(), "left, then right"
+    distance = np.hypot(np.diff(traces[1].x[:, 0]), np.diff(traces[1].y[:, 0]))
+    assert distance == pytest.approx(np.diff(traces[1].driven), abs=1e-3)
+    with pytest.raises(ConfigError, match=r"its period is 0\.03 s; it must divide 0\.1 s"):
+        drive(requests, device="cpu", driver=SimpleNamespace(name="odd", period=0.03))
 
 
 BAD = {

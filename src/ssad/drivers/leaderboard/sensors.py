@@ -33,6 +33,8 @@ LIMITS: Final[Mapping[str, int]] = {
     "sensor.speedometer": 1,
 }
 """Kinds of sensors -> how many of one an agent may have."""
+TURNS: Final = 10.0  # of a LiDAR in a second
+_ROUNDING: Final = 1e-4  # turns
 _FADE: Final = 0.004  # 1/m by which the intensity of a LiDAR's points falls
 _RANGE, _REACH = 85.0, 100.0  # m, of LiDAR and radar
 _RIGHT: Final = np.array(
@@ -127,6 +129,20 @@ def radar_of(specification: Mapping[str, Any]) -> Lidar:
     elevations: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (vertical / 12) - 0.5 * vertical
     pose = sensor_pose(specification, _RIGHT)
     return Lidar(elevations, 12, pose, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=horizontal)
+
+
+def fired_points(points: F32, start: float, end: float) -> F32:
+    """Return the points of a turn [P, 4] that a LiDAR fires from one time to another, s: it turns ten times a second.
+
+    It turns clockwise and looks ahead at time 0. At 20 Hz every reading is half a turn, right and left by turns.
+    """
+    share = (end - start) * TURNS
+    if share > 1.0 - _ROUNDING:
+        return points
+    # Rounding moves the bounds of a reading, but never both of two that follow each other.
+    first = math.remainder(round(start * TURNS / _ROUNDING) * _ROUNDING, 1.0)
+    turned = np.arctan2(points[:, 1], points[:, 0]) / math.tau
+    return points[(turned - first) % 1.0 < round(share / _ROUNDING) * _ROUNDING]
 
 
 def carla_points(points: F32) -> F32:
