@@ -107,6 +107,7 @@ class _NamedDriver:
         self.reset = system.reset
         self.act = system.act
         self.cameras: Mapping[str, Camera] = getattr(system, "cameras", {})
+        self.depth_cameras: Mapping[str, Camera] = getattr(system, "depth_cameras", {})
         self.lidars: Mapping[str, Lidar] = getattr(system, "lidars", {})
         self.radars: Mapping[str, Lidar] = getattr(system, "radars", {})
         if isinstance(system, Believer):

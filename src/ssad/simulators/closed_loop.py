@@ -22,7 +22,7 @@ from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 if TYPE_CHECKING:
-    from ssad.core.frames import Camera
+    from ssad.core.frames import Camera, DepthCamera
     from ssad.drivers.careful.grade import Grade
     from ssad.rendering.lidar import Lidar
 
@@ -305,19 +305,21 @@ def steps_per_trace_step(driver: Driver) -> int:
     return count
 
 
-def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | DepthCamera | tuple[str, Lidar]]:
     """Return the sensors that drivers name in `sensors`, by name.
 
     Returns:
-        Cameras, and pairs ("lidar" or "radar", model).
+        Cameras, depth cameras, and pairs ("lidar" or "radar", model).
     """
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.camera.rig import rig_camera
     from ssad.rendering.lidar import HDL32E
 
-    sensors: dict[str, Camera | tuple[str, Lidar]] = {}
+    sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = {}
     for driver in drivers:
         # A driver's own models take precedence over the sensors of nuScenes with the same name.
-        driver_sensors: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors |= {name: DepthCamera(camera) for name, camera in getattr(driver, "depth_cameras", {}).items()}
         driver_sensors |= {
             name: ("lidar", sensor_model) for name, sensor_model in getattr(driver, "lidars", {}).items()
         }
@@ -339,6 +341,7 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     required = requested_sensors(drivers)
     if not required:
         return {}
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.onboard import Onboard
     from ssad.rendering.radar import OnboardRadar
 
@@ -349,6 +352,8 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
             sensors[name] = (
                 onboard.lidar(sensor_model[1]) if sensor_model[0] == "lidar" else OnboardRadar(onboard, sensor_model[1])
             )
+        elif isinstance(sensor_model, DepthCamera):
+            sensors[name] = onboard.depth_camera(sensor_model.camera)
         else:
             sensors[name] = onboard.camera(sensor_model)
     return sensors

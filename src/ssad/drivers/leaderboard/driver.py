@@ -37,12 +37,14 @@ from ssad.drivers.leaderboard.road_map import OPTIONS, TownMap, road_options, tr
 from ssad.drivers.leaderboard.scene import STEP, CarlaDataProvider, HostedScene
 from ssad.drivers.leaderboard.sensors import (
     CAMERA,
+    DEPTH,
     LIDAR,
     MAP,
     RADAR,
     camera_of,
     carla_points,
     check_sensors,
+    encode_depth,
     fired_points,
     geolocation,
     lidar_of,
@@ -104,7 +106,12 @@ class Leaderboard:
             for specification in self._specifications
             if specification["type"] == RADAR
         }
-        self.sensors = (*self.cameras, *self.lidars, *self.radars)
+        self.depth_cameras: Mapping[str, Camera] = {
+            specification["id"]: camera_of(specification)
+            for specification in self._specifications
+            if specification["type"] == DEPTH
+        }
+        self.sensors = (*self.cameras, *self.depth_cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
         self._episodes: list[Episode] = []
         self._scenes: list[HostedScene] = []
@@ -228,6 +235,8 @@ class Leaderboard:
                 alpha = np.full((1, *image.shape[1:]), 255, np.uint8)
                 # CARLA delivers BGRA.
                 value = np.concatenate([image[::-1], alpha]).transpose(1, 2, 0).copy()
+            elif sensor_type == DEPTH:
+                value = encode_depth(view.readings[specification["id"]][row])
             elif sensor_type == LIDAR:
                 points = carla_points(view.readings[specification["id"]][row])
                 value = fired_points(points, time - self._elapsed(view, row), time)
