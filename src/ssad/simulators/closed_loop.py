@@ -16,18 +16,23 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
-from ssad.core.registry import Reference
-from ssad.core.source import source_version
+from ssad.core.registry import Reference, check_arguments, make, resolve
+from ssad.core.source import plugin_version, source_version
+from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 if TYPE_CHECKING:
-    from ssad.core.frames import Camera
+    from ssad.core.frames import Camera, DepthCamera
     from ssad.drivers.careful.grade import Grade
     from ssad.rendering.lidar import Lidar
 
 STEP = 0.1  # s
 WIDTH = 640  # pixels of a picture of nuScenes' rig
 HIGHWAY = "highway-env"  # as a set of scenarios
+EMBEDDED = "embedded"
+SIMULATORS: dict[str, str] = {EMBEDDED: "ssad.world.world:World"}
+"""Simulator -> "module:object", called with episodes, lane graphs and a keyword `device`; carla://HOST:PORT apart."""
+MEMBERS = ("dt", "batch", "agents", "episodes", "assigned", "graphs", "reset", "step", "state", "ended", "take")
 HIGHWAY_TYPE = "ssad.simulators.highway_env:SCENARIO"
 
 
@@ -49,6 +54,45 @@ class EpisodeRequest(Protocol):
     @property
     def spec(self) -> Mapping[str, Any]:
         """Scenario (see `scenario_json`), repetition (0: nominal), spread, and any external simulator."""
+
+
+def is_carla(simulator: str | None) -> bool:
+    """Return True for the address of a CARLA server."""
+    return simulator is not None and simulator.partition(":")[0] == "carla"
+
+
+def simulator_version(name: str) -> str:
+    """Return 12 hex digits over the source of a simulator of the user's own; "" for SSAD's own world.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+        ConfigError: It takes no such arguments.
+    """
+    target = resolve("simulator", SIMULATORS, Reference.parse(name).name)
+    check_arguments("simulator", name, target, extra_arguments={"episodes": (), "graphs": {}, "device": "cpu"})
+    return plugin_version("simulator", SIMULATORS, name)
+
+
+def make_simulator(
+    name: str, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], *, device: str
+) -> Simulator:
+    """Return a simulator that runs some episodes side by side.
+
+    Args:
+        name: Key of `SIMULATORS`, entry point of the group `ssad.simulators`, or "module:object"; arguments may follow.
+        episodes: The episodes.
+        graphs: Lane graph of each of their towns.
+        device: cpu or cuda.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+        ConfigError: It cannot be made, or lacks an attribute or a method of `ssad.core.driving.Simulator`.
+    """
+    reference = Reference.parse(name)
+    target = resolve("simulator", SIMULATORS, reference.name)
+    options = {"episodes": episodes, "graphs": graphs, "device": device, **reference.options}
+    simulator: Simulator = make("simulator", reference.name, target, options, MEMBERS)
+    return simulator
 
 
 def load_kernels(device: str) -> None:
@@ -109,12 +153,14 @@ def policies_of(scenario: Scenario) -> list[str]:
 
 
 def type_version(name: str) -> str:
-    """Return 12 hex digits over the source of a user's scenario type ("module:object"); "" for a built-in one.
+    """Return 12 hex digits over the source of a user's scenario type; "" for a built-in one.
 
     The type that highway-env runs has the version of highway-env appended.
     """
-    source_hash = source_version(name.partition(":")[0]) if ":" in name else ""
-    return f"{source_hash} {version('highway-env')}" if name == HIGHWAY_TYPE else source_hash
+    from ssad.scenarios.dynamic.catalogue import TYPES
+
+    source_hash = plugin_version("scenario", TYPES, name)
+    return f"{source_hash} {version('highway-env')}".strip() if name == HIGHWAY_TYPE else source_hash
 
 
 def runs_in_highway_env(request: EpisodeRequest) -> bool:
@@ -199,14 +245,16 @@ def drive(
     for agent_driver in (system, *policies.values()):
         if callable(getattr(agent_driver, "to", None)):
             agent_driver.to(device)  # type: ignore[attr-defined]
-    server_spec = requests[0].spec.get("simulator")
+    simulator_name = requests[0].spec.get("simulator", EMBEDDED)
+    is_embedded = simulator_name == EMBEDDED and not runs_in_highway_env(requests[0])
+    steps_in_one = steps_per_trace_step(system) if is_embedded else 1
     simulator: Simulator
-    if server_spec:
+    if is_carla(simulator_name):
         from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
         from ssad.simulators.carla.server import Server
         from ssad.simulators.carla.simulator import Carla
 
-        server = Server.of(server_spec)
+        server = Server.of(simulator_name)
         carla_cameras = (
             sensor_blueprints(requested_sensors([system]), STEP)
             if server.sensors == "carla" and sensors is None
@@ -217,15 +265,23 @@ def drive(
             sensors = onboard_sensors(list(policies.values()), device) | {
                 name: CarlaSensor(name) for name in carla_cameras
             }
+    elif runs_in_highway_env(requests[0]):
+        simulator = HighwayEnv(episodes, graphs)
+    elif steps_in_one > 1:
+        finer_episodes = [
+            replace(episode, limits=replace(episode.limits, max_steps=episode.limits.max_steps * steps_in_one))
+            for episode in episodes
+        ]
+        simulator = World(finer_episodes, graphs, device=device, dt=STEP / steps_in_one, substeps=1)
     else:
-        simulator = (
-            HighwayEnv(episodes, graphs) if runs_in_highway_env(requests[0]) else World(episodes, graphs, device=device)
-        )
+        simulator = make_simulator(simulator_name, episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
-        simulator_metrics = dict(getattr(simulator, "measured", {}))
+        if steps_in_one > 1:  # traces have steps of 0.1 s, however often a driver is asked
+            traces = [merge_steps(trace, steps_in_one) for trace in traces]
+        simulator_metrics = dict(getattr(simulator, "measured", {})) if is_carla(simulator_name) else {}
     finally:
         # External simulators hold a connection, which must end even if a driver raises.
         getattr(simulator, "close", lambda: None)()
@@ -236,19 +292,34 @@ def drive(
     )
 
 
-def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+def steps_per_trace_step(driver: Driver) -> int:
+    """Return how often a driver is asked in a step of 0.1 s: once, or by its `period`.
+
+    Raises:
+        ConfigError: Its period does not divide 0.1 s.
+    """
+    period = float(getattr(driver, "period", STEP))
+    count = round(STEP / period) if period > 0.0 else 0
+    if count < 1 or abs(count * period - STEP) > 1e-6:
+        raise ConfigError(f"system {driver.name}: its period is {period:g} s; it must divide {STEP} s, such as 0.05")
+    return count
+
+
+def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | DepthCamera | tuple[str, Lidar]]:
     """Return the sensors that drivers name in `sensors`, by name.
 
     Returns:
-        Cameras, and pairs ("lidar" or "radar", model).
+        Cameras, depth cameras, and pairs ("lidar" or "radar", model).
     """
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.camera.rig import rig_camera
     from ssad.rendering.lidar import HDL32E
 
-    sensors: dict[str, Camera | tuple[str, Lidar]] = {}
+    sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = {}
     for driver in drivers:
         # A driver's own models take precedence over the sensors of nuScenes with the same name.
-        driver_sensors: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors |= {name: DepthCamera(camera) for name, camera in getattr(driver, "depth_cameras", {}).items()}
         driver_sensors |= {
             name: ("lidar", sensor_model) for name, sensor_model in getattr(driver, "lidars", {}).items()
         }
@@ -270,6 +341,7 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     required = requested_sensors(drivers)
     if not required:
         return {}
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.onboard import Onboard
     from ssad.rendering.radar import OnboardRadar
 
@@ -280,6 +352,8 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
             sensors[name] = (
                 onboard.lidar(sensor_model[1]) if sensor_model[0] == "lidar" else OnboardRadar(onboard, sensor_model[1])
             )
+        elif isinstance(sensor_model, DepthCamera):
+            sensors[name] = onboard.depth_camera(sensor_model.camera)
         else:
             sensors[name] = onboard.camera(sensor_model)
     return sensors

@@ -17,14 +17,21 @@ SCENARIOS: dict[str, str] = {
     "RightTurn": f"{_HERE}.right_turn:SCENARIO",
     "CrossingNegotiation": f"{_HERE}.crossing_negotiation:SCENARIO",
     "NaturalJunction": f"{_HERE}.natural_junction:SCENARIO",
+    "FreeDrive": f"{_HERE}.free_drive:SCENARIO",
 }
 """Scenario class name -> "module:object", a `ScenarioType`."""
 
 PRECRASH: tuple[str, ...] = tuple(SCENARIOS)[:8]
 """The eight pre-crash classes, in the order of the paper's table."""
 
+FREE_DRIVE = "FreeDrive"
+"""The type of routes without a scenario of their own: natural traffic alone."""
+
 CUSTOM = "Custom"
 """The type whose scenarios list their actors themselves."""
+
+TYPES: dict[str, str] = {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}
+"""All built-in types of scenarios."""
 
 
 def scenario_type(name: str) -> ScenarioType:
@@ -40,7 +47,7 @@ def scenario_type(name: str) -> ScenarioType:
         UnknownNameError: No class has that name; the message lists the closest ones.
         ConfigError: A user module fails to import, or the name refers to another object.
     """
-    resolved = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
+    resolved = resolve("scenario", TYPES, name)
     if not isinstance(resolved, ScenarioType):
         raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(resolved).__name__}")
     return resolved

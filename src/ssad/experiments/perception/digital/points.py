@@ -12,9 +12,10 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.schema import Schema
+from ssad.core.source import plugin_version
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
-from ssad.scenarios.static.digital.defences import RandomResize, make_defence
+from ssad.scenarios.static.digital.defences import DEFENCES, Defence, RandomDefence, make_defence
 from ssad.scenarios.static.digital.objectives import UNDIVIDED
 from ssad.scenarios.static.digital.spec import AttackSpec, has_option
 from ssad.scenarios.static.digital.universal import UniversalFit
@@ -63,7 +64,7 @@ class Guard(Schema):
     """A defence before the detector.
 
     Attributes:
-        name: jpeg, bits, blur or resize.
+        name: jpeg, bits, blur, resize, or module:object.
         options: Further settings, such as quality.
     """
 
@@ -159,6 +160,10 @@ class AttackTable(Schema):
         """Turn a bare name into an entry with default settings."""
         return named(value)
 
+    def loss_of(self, method: Method) -> str:
+        """Return the loss that an attack of the table ascends."""
+        return method.loss or default_loss(method.name)
+
 
 @dataclass(frozen=True)
 class Guarded:
@@ -171,6 +176,20 @@ class Guarded:
     def text(self) -> str:
         """Such as "jpeg quality=50"."""
         return " ".join([self.name, *(f"{key}={value}" for key, value in self.options)])
+
+    @property
+    def version(self) -> str:
+        """Version of a defence of the user's own; "" for one of SSAD."""
+        return plugin_version("defence", DEFENCES, self.name)
+
+    def make(self) -> Defence:
+        """Return the defence.
+
+        Raises:
+            UnknownNameError: There is no such defence.
+            ConfigError: An option is unknown or has an invalid value.
+        """
+        return make_defence(self.name, **dict(self.options))
 
 
 @dataclass(frozen=True)
@@ -197,6 +216,12 @@ class AttackPoint:
     def attack(self) -> str:
         """Name of the attack; "clean" without one."""
         return self.specs[0].name if len(self.specs) == 1 else ENSEMBLE if self.specs else "clean"
+
+    @property
+    def version(self) -> str:
+        """Versions of the attacks, losses and the defence that are the user's own; "" for those of SSAD."""
+        versions = [spec.version for spec in self.specs] + [self.defence.version if self.defence else ""]
+        return " ".join(filter(None, versions))
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -246,8 +271,8 @@ def guard_of(suite: AttackTable, entry: AttackEntry) -> Guarded | None:
         if entry.aware:
             raise ConfigError(f"suite {suite.name}: attack {entry.name}: aware of which defence? it names none")
         return None
-    make_defence(entry.defence.name, **entry.defence.options)
     defence = Guarded(entry.defence.name, tuple(sorted(entry.defence.options.items())))
+    defence.make()
     if any(not isinstance(value, str | int | float) for _, value in defence.options):
         raise ConfigError(f"suite {suite.name}: defence {defence.name}: options are numbers and words")
     return defence
@@ -269,15 +294,13 @@ def rows_of(suite: AttackTable) -> list[AttackPoint]:
             raise ConfigError(f"suite {suite.name}: attack {ENSEMBLE}: its members have different budgets")
         if not specs:
             draws = (
-                (entry.draws or DRAWS)
-                if defence and entry.aware and isinstance(make_defence(defence.name), RandomResize)
-                else 0
+                (entry.draws or DRAWS) if defence and entry.aware and isinstance(defence.make(), RandomDefence) else 0
             )
             classes, becomes = tuple(entry.classes), tuple(sorted(entry.becomes.items()))
             for name in [*classes, *entry.becomes, *entry.becomes.values()]:
                 if name not in MMDET3D_CLASSES:
                     raise unknown_name("class", name, MMDET3D_CLASSES)
-            if becomes and (entry.loss or default_loss(entry.name)) != "mislabel":
+            if becomes and suite.loss_of(entry) != "mislabel":
                 raise ConfigError(f"suite {suite.name}: attack {entry.name}: becomes needs loss: mislabel")
             spec = replace(
                 _spec(suite, entry, entry.radius, entry.steps),
@@ -323,13 +346,18 @@ def points_of(suite: AttackTable) -> list[AttackPoint]:
         for point in rows
         if point.defence
     ]
-    return _with_controls([*rows, *sweep_points, *undefended_points, *transfer_points])
+    return _with_controls(suite, [*rows, *sweep_points, *undefended_points, *transfer_points])
 
 
-def _with_controls(points: Sequence[AttackPoint]) -> list[AttackPoint]:
+def _with_controls(suite: AttackTable, points: Sequence[AttackPoint]) -> list[AttackPoint]:
     """Return the clean data and noise that points are compared with, and then the points, each once."""
     noise_points = [
-        replace(point, specs=(AttackSpec("noise", default_loss("noise"), point.specs[0].norm, point.specs[0].radius),))
+        replace(
+            point,
+            specs=(
+                AttackSpec("noise", suite.loss_of(Method(name="noise")), point.specs[0].norm, point.specs[0].radius),
+            ),
+        )
         for point in points
         if point.defence is None
     ]
@@ -355,7 +383,9 @@ def hardened_points(suite: AttackTable) -> list[AttackPoint]:
         ConfigError: An attack does not exist or refuses a setting.
     """
     over_radii = [selected.model_copy(update={"steps": []}) for selected in suite.sweeps if selected.radii]
-    return _with_controls([*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)])
+    return _with_controls(
+        suite, [*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)]
+    )
 
 
 def transfers_of(suite: AttackTable) -> list[AttackPoint]:
@@ -376,7 +406,7 @@ def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int |
     options = dict(method.options)
     if steps is not None or has_option(method.name, "steps"):
         options.setdefault("steps", suite.steps if steps is None else steps)
-    loss = method.loss or default_loss(method.name)
+    loss = suite.loss_of(method)
     make_objective(loss)
     norm: Norm = method.norm
     radius_value = suite.radius if radius is None else radius
