@@ -8,6 +8,7 @@ import zipfile
 from collections import OrderedDict, defaultdict
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,6 +171,78 @@ def test_averaged_weights_win(tmp_path: Path) -> None:
     module, average = toy(), Toy()
     torch.save({"model": module.state_dict(), "average": average.state_dict()}, tmp_path / "last.pt")
     assert same(load_weights(tmp_path / "last.pt"), dict(average.state_dict()))
+
+
+def averaged() -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights of a training and their averages."""
+    return dict(toy().state_dict()), dict(Toy().state_dict())
+
+
+def prefixed(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {f"{prefix}{name}": value for name, value in state.items()}
+
+
+OPTIMISER = {"state": {0: {"exp_avg": torch.ones(3)}}, "param_groups": [{"lr": 0.1}]}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        # Ultralytics; the same interrupted before the first average; RT-DETR; torchvision's references; timm
+        lambda plain, mean: {"model": plain, "ema": mean, "optimizer": OPTIMISER, "updates": 7},
+        lambda plain, mean: {"model": mean, "ema": None, "optimizer": OPTIMISER},
+        lambda plain, mean: {"model": plain, "ema": {"module": mean, "updates": torch.tensor(7)}},
+        lambda plain, mean: {"model": plain, "model_ema": prefixed("module.", mean) | {"n_averaged": torch.tensor(3)}},
+        lambda plain, mean: {"state_dict": plain, "state_dict_ema": mean, "optimizer": OPTIMISER},
+        lambda plain, mean: {"params": plain, "params_ema": mean},
+        lambda plain, mean: {"state_dict": prefixed("module.", plain), "ema_state_dict": prefixed("module.", mean)},
+        # mmengine: its average holds the plain weights, and a counter tells it
+        lambda plain, mean: {
+            "state_dict": mean,
+            "ema_state_dict": prefixed("module.", plain) | {"steps": torch.tensor(9)},
+        },
+        # Lightning and others: both copies in one state dict; mmcv: the plain weights under names without dots
+        lambda plain, mean: {"state_dict": prefixed("model.", plain) | prefixed("ema_model.", mean)},
+        lambda plain, mean: {"state_dict": plain | prefixed("ema.module.", mean)},
+        lambda plain, mean: {"state_dict": mean | {f"ema_{key.replace('.', '_')}": plain[key] for key in plain}},
+        # latent diffusion: an average whose names tell no layers
+        lambda plain, mean: {
+            "state_dict": mean | {f"model_ema.{key.replace('.', '')}": value for key, value in plain.items()}
+        },
+        lambda plain, mean: prefixed("module._orig_mod.", mean),
+    ],
+)
+def test_the_averaged_copy_is_loaded(case: Any, tmp_path: Path) -> None:
+    plain, mean = averaged()
+    torch.save(case(plain, mean), tmp_path / "last.pt")
+    assert same(load_weights(tmp_path / "last.pt"), mean)
+
+
+def test_a_line_says_which_copy_is_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain, mean = averaged()
+    for tree, message in (
+        ({"model": plain, "ema": {"module": mean}, "optimizer": OPTIMISER}, "averaged weights of 'ema.module'; not"),
+        ({"model": plain, "ema": {"module": mean}, "optimizer": OPTIMISER}, "not loaded: model, optimizer"),
+        (plain | prefixed("model_ema.", mean), "loads the averaged weights 'model_ema.*'; not loaded: "),
+        (mean | {f"ema_{key.replace('.', '_')}": plain[key] for key in plain}, "what mmcv has averaged"),
+        (plain | {f"model_ema.{key.replace('.', '')}": mean[key] for key in mean}, "tell no layers"),
+    ):
+        torch.save(tree, tmp_path / "a.pt")
+        load_weights(tmp_path / "a.pt")
+        captured = capsys.readouterr()
+        assert message in captured.err
+        assert captured.err.count("\n") == 1
+        assert not captured.out
+    torch.save({"model": plain, "optimizer": OPTIMISER}, tmp_path / "a.pt")
+    load_weights(tmp_path / "a.pt")
+    assert not capsys.readouterr().err  # there is nothing to choose
+
+
+def test_a_checkpoint_of_unnamed_networks_names_them(tmp_path: Path) -> None:
+    torch.save({"teacher": toy().state_dict(), "student": toy().state_dict()}, tmp_path / "a.pt")
+    with pytest.raises(FormatError, match=r"no state dict .*; entries: teacher, student") as caught:
+        load_weights(tmp_path / "a.pt")
+    one_line(caught.value)
 
 
 @STREAMS
@@ -527,6 +600,41 @@ def test_counters_of_steps_may_be_missing() -> None:
     module = Toy()
     copy_state(module, state, "w.pth")
     assert same({k: v for k, v in module.state_dict().items() if k in state}, state)
+
+
+def test_buffers_of_other_frameworks_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    state = dict(toy().state_dict())
+    module = Toy()
+    foreign = {
+        "pixel_mean": torch.tensor([103.53, 116.28, 123.675]).view(3, 1, 1),
+        "data_preprocessor.std": torch.ones(3, 1, 1),
+        "head.anchors": torch.zeros(3, 3, 2),
+        "body.total_ops": torch.zeros(1),
+    }
+    copy_state(module, state | foreign, "w.pth")
+    assert same(dict(module.state_dict()), state)
+    line = capsys.readouterr().err
+    assert line.startswith("w.pth: not loaded, since toy has its own: pixel_mean [103.53, 116.28, 123.675]")
+    assert "head.anchors [3, 3, 2]" in line
+    assert "foreign: normalizer" in refused(state | {"normalizer": torch.ones(3)})
+
+
+def test_counters_of_steps_may_be_in_excess(capsys: pytest.CaptureFixture[str]) -> None:
+    class Frozen(nn.Module):
+        """A norm without a counter."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            for name in ("weight", "bias", "running_mean", "running_var"):
+                self.register_buffer(name, torch.zeros(4))
+
+    state = dict(nn.BatchNorm2d(4).state_dict())
+    module = Frozen()
+    copy_state(module, state, "w.pth")
+    assert torch.equal(module.get_buffer("running_var"), torch.ones(4))
+    assert not capsys.readouterr().err
+    with pytest.raises(FormatError, match=r"foreign: other\.num_batches_tracked"):
+        copy_state(module, state | {"other.num_batches_tracked": torch.tensor(1)}, "w.pth")
 
 
 def test_modes_and_gradients_stay() -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from ssad.cli import paths
 from ssad.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def export_scenarios(
 
     The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
     """
+    paths.check_out(out, paths.EXPORTED_SCENARIOS, option="OUT")
     from ssad.interchange.export import export_commonroad, export_openscenario
     from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios

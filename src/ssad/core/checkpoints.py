@@ -11,7 +11,8 @@ import difflib
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,19 @@ from safetensors.torch import save as dump_safetensors
 from torch import Tensor, nn
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
-from ssad.core.pickled import MAX_BYTES, read_pickled
+from ssad.core.pickled import COUNTERS, MAX_BYTES, NESTS, read_pickled
 from ssad.core.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
 from ssad.core.version import __version__
 
 PICKLED = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 SHARD = re.compile(r"(?P<stem>.+)-(?P<number>\d{5})-of-(?P<count>\d{5})\.safetensors")
 HALF_MAX = 65504.0
+WRAPPERS = ("module.", "_orig_mod.")
+AVERAGE_PREFIXES = ("ema_model.", "model_ema.", "ema.", "ema_net.")
+# What other frameworks keep beside the weights: the means that images are normalised with, anchors, and profiles
+PREPROCESSOR = re.compile(
+    r"(?:.*\.)?(?:pixel_mean|pixel_std|anchor_grid|anchors|total_ops|total_params)|data_preprocessor\..+"
+)
 COUNTER = "num_batches_tracked"  # BatchNorm's counter of training steps, which old files and frozen norms lack
 
 
@@ -83,14 +90,22 @@ def load_weights(path: str | Path) -> dict[str, Tensor]:
         path: .safetensors: one file, or shards (any one of them, NAME.safetensors for
             NAME-00001-of-00003.safetensors, an index NAME.safetensors.index.json, or the folder). .pth, .pt,
             .ckpt, .bin: the state dict in a PyTorch checkpoint, also inside "state_dict", "model" or "ema"
-                (averaged weights win), or of a pickled module.
+                (`ssad.core.pickled.NESTS`), or of a pickled module.
+
+    Of several copies of the weights, in entries of a checkpoint or under prefixes of the names, the averaged one is
+    loaded, and a line on standard error says which. Prefixes of parallel training are removed.
 
     Raises:
         FormatError: The file cannot be read, or holds no such tensors.
     """
     source = Path(path).expanduser()
     if source.suffix in PICKLED and source.is_file():
-        return _strip_prefixes(read_pickled(source))
+        pickled = read_pickled(source)
+        copies = set(pickled.rest) & set(NESTS)
+        if copies:
+            kind = "averaged weights" if pickled.is_average else "weights"
+            _say(f"{source}: loads the {kind} of '{'.'.join(pickled.entry)}'; not loaded: {', '.join(pickled.rest)}")
+        return _select_copy(pickled.tensors, source)
     weights_files = _parts(source)
     state: dict[str, Tensor] = {}
     for weights_file in weights_files:
@@ -103,14 +118,55 @@ def load_weights(path: str | Path) -> dict[str, Tensor]:
         state |= tensors
     if not state:
         raise FormatError(f"{source}: holds no tensors")
-    return _strip_prefixes(state)
+    return _select_copy(state, source)
+
+
+def _say(message: str) -> None:
+    """Print a line for the user, beside results on the standard output."""
+    print(message, file=sys.stderr)
+
+
+def _select_copy(state: dict[str, Tensor], source: Path) -> dict[str, Tensor]:
+    """Return one copy of the weights, without prefixes and counters: of several the averaged one, which is printed."""
+    state = _strip_prefixes(state)
+    averages = {
+        prefix: {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        for prefix in AVERAGE_PREFIXES
+    }
+    for prefix, prefixed in averages.items():
+        average = _strip_prefixes(prefixed)
+        other_names = [name for name in state if not name.startswith(prefix)]
+        if not average or not other_names:
+            continue
+        # Some frameworks take the dots out of the names of an average; its layers cannot be told then.
+        if any("." in name for name in other_names) and not any("." in name for name in average):
+            _say(f"{source}: the names of the averaged weights ({prefix}*) tell no layers; loads those beside them")
+            return _strip_prefixes({name: state[name] for name in other_names})
+        _say(f"{source}: loads the averaged weights '{prefix}*'; not loaded: {_examples(other_names)}")
+        return average
+    # mmcv exchanges averages and weights before it saves, so the names of the layers hold the averages.
+    stored_names = {f"ema_{name.replace('.', '_')}" for name in state}
+    exchanged_names = [name for name in state if name in stored_names]
+    if exchanged_names:
+        _say(
+            f"{source}: loads what mmcv has averaged, by the names of layers; not loaded: {_examples(exchanged_names)}"
+        )
+    return {name: value for name, value in state.items() if name not in stored_names}
+
+
+def _examples(names: Sequence[str]) -> str:
+    """Return up to three names, and how many there are."""
+    return ", ".join(names[:3]) + (f", ... ({len(names)} in all)" if len(names) > 3 else "")
 
 
 def _strip_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Remove the prefixes that parallel training adds to all names."""
-    while state and all(name.startswith("module.") for name in state):
-        state = {name.removeprefix("module."): value for name, value in state.items()}
-    return state
+    """Remove the prefixes that parallel training, compiling and averaging add to all names but those of counters."""
+    while True:
+        names = [name for name in state if name not in COUNTERS]
+        prefix = next((prefix for prefix in WRAPPERS if all(name.startswith(prefix) for name in names)), None)
+        if prefix is None or not names:
+            return state
+        state = {name.removeprefix(prefix): state[name] for name in names}
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
@@ -385,7 +441,8 @@ def check_finite(state: Mapping[str, Tensor], origin: str) -> None:
 def copy_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> None:
     """Copy weights into a module of the same names and shapes; on an error the module stays unchanged.
 
-    Values are cast to the module's types. Missing counters of BatchNorm's steps are accepted.
+    Values are cast to the module's types. Counters of BatchNorm's steps may be missing or in excess. Buffers of other
+    frameworks that prepare images, anchors and profiles are left out, and a line on standard error names them.
 
     Args:
         module: The module.
@@ -398,6 +455,10 @@ def copy_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Pat
     """
     parameters = module.state_dict(keep_vars=True)
     name = str(getattr(module, "name", type(module).__name__))
+    foreign_buffers = {key: state[key] for key in state if key not in parameters and PREPROCESSOR.fullmatch(key)}
+    left_out = {key for key in state if key.endswith(COUNTER) and key.replace(COUNTER, "running_var") in parameters}
+    left_out = (left_out | foreign_buffers.keys()) - parameters.keys()
+    state = {key: value for key, value in state.items() if key not in left_out}
     missing = [key for key in parameters if key not in state and not key.endswith(COUNTER)]
     unexpected = [key for key in state if key not in parameters]
     if missing or unexpected:
@@ -421,9 +482,17 @@ def copy_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Pat
             dtype_name = str(value.dtype).removeprefix("torch.")
             raise FormatError(f"{origin}: '{key}' holds {dtype_name} numbers, {name} takes floats (quantised weights?)")
     check_finite(state, str(origin))
+    if foreign_buffers:
+        described = ", ".join(f"{key} {_values(value)}" for key, value in foreign_buffers.items())
+        _say(f"{origin}: not loaded, since {name} has its own: {described}")
     with torch.no_grad():
         for key, value in state.items():
             parameters[key].copy_(value)
+
+
+def _values(value: Tensor) -> str:
+    """Return up to three numbers of a tensor, or its shape."""
+    return str([round(number, 4) for number in value.flatten().tolist()] if value.numel() <= 3 else list(value.shape))
 
 
 def copy_matching_weights(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> list[str]:

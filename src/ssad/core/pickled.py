@@ -35,7 +35,22 @@ DEEPEST = 60
 MAX_STATE_ENTRIES = 200_000
 MAX_EXPANSION = 16  # limit of the tensors' total size, in sizes of the file; tensors may share storage
 CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state_dict(), 'weights.safetensors')"
-NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
+# Entries that hold weights, averaged over the training (Ultralytics, RT-DETR, torchvision, timm, BasicSR, ...) or not
+AVERAGES = (
+    "ema",
+    "ema_model",
+    "model_ema",
+    "ema_state_dict",
+    "state_dict_ema",
+    "model_ema_state_dict",
+    "ema_net",
+    "params_ema",
+    "average",
+)
+COPIES = ("state_dict", "model_state_dict", "model", "module", "net", "network", "weights", "params")
+NESTS = (*AVERAGES, *COPIES)
+SWAPPED = "ema_state_dict"  # mmengine exchanges its values with those of state_dict, which then are the averages
+COUNTERS = frozenset({"n_averaged", "steps", "step", "updates", "num_updates", "decay", "initted", "warmups"})
 
 _KINDS = {
     "DoubleStorage": torch.float64,
@@ -198,6 +213,23 @@ class _Reader(pickle.Unpickler):
         return _Storage(pid[1], str(pid[2]), pid[4])
 
 
+@dataclass(frozen=True, slots=True)
+class PickledState:
+    """The state dict of a checkpoint.
+
+    Attributes:
+        tensors: Tensors by name.
+        entry: Names of the nested entries that lead to it; empty: the file is the state dict.
+        is_average: Whether the names of the entries, or who wrote them, say that these are averaged weights.
+        rest: Entries beside it that are not read: other copies of the weights, and states of optimisers.
+    """
+
+    tensors: dict[str, Tensor]
+    entry: tuple[str, ...] = ()
+    is_average: bool = False
+    rest: tuple[str, ...] = ()
+
+
 class _TensorReader:
     """Reads tensors once the pickle is loaded."""
 
@@ -237,7 +269,7 @@ class _TensorReader:
         return storage_bytes[: element_limit * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
 
 
-def read_pickled(path: str | Path) -> dict[str, Tensor]:
+def read_pickled(path: str | Path) -> PickledState:
     """Return the state dict in a checkpoint file: alone, nested (`NESTS`, averaged weights first), or of a module.
 
     Raises:
@@ -251,8 +283,8 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
     try:
         with ExitStack() as files:
             tree, numbers, names = _read_zip(path, files) if signature[:2] == b"PK" else _read_stream(path)
-            state = _state(tree, 0)
-            if state is None:
+            choice = _state(tree, 0)
+            if choice is None:
                 other_names = ", ".join(
                     sorted(
                         global_name
@@ -260,11 +292,13 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
                         if global_name not in _MAKERS and not global_name.startswith("torch.")
                     )[:3]
                 )
+                entries = ", ".join(key for key in (_as_mapping(tree) or {}) if isinstance(key, str))[:100]
                 raise FormatError(
-                    f"{path}: holds no state dict (tensors by "
-                    f"name){f', but {other_names}' if other_names else ''}; {CONVERT}"
+                    f"{path}: holds no state dict (tensors by name){f', but {other_names}' if other_names else ''}"
+                    f"{f'; entries: {entries}' if entries else ''}; {CONVERT}"
                 )
-            return {name: numbers.tensor(value) for name, value in state}
+            tensors = {name: numbers.tensor(value) for name, value in choice.tensors}
+            return PickledState(tensors, choice.entry, choice.is_average, choice.rest)
     except FormatError:
         raise
     except RefusedError as error:
@@ -350,7 +384,17 @@ def _as_mapping(value: Any) -> Mapping[Any, Any] | None:
     return None
 
 
-def _state(tree: Any, depth: int) -> list[tuple[str, _StridedTensor]] | None:
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """A state dict that is not built yet; see `PickledState`."""
+
+    tensors: list[tuple[str, _StridedTensor]]
+    entry: tuple[str, ...] = ()
+    is_average: bool = False
+    rest: tuple[str, ...] = ()
+
+
+def _state(tree: Any, depth: int) -> _Choice | None:
     """Return names and tensors of the first state dict in a tree, None if there is none."""
     if depth > 4:
         return None
@@ -359,7 +403,7 @@ def _state(tree: Any, depth: int) -> list[tuple[str, _StridedTensor]] | None:
         and isinstance(tree.state, dict)
         and _as_mapping(tree.state.get("_modules")) is not None
     ):
-        return _module(tree)
+        return _Choice(_module(tree))
     mapping = _as_mapping(tree)
     if mapping is None:
         inner_state = (
@@ -369,13 +413,27 @@ def _state(tree: Any, depth: int) -> list[tuple[str, _StridedTensor]] | None:
     named_tensors = [
         (key, value) for key, value in mapping.items() if isinstance(key, str) and isinstance(value, _StridedTensor)
     ]
-    if named_tensors:
-        return named_tensors
+    # An average may keep its counters beside the entry that holds its weights.
+    if any(name not in COUNTERS for name, _ in named_tensors):
+        return _Choice(named_tensors)
+    is_swapped = "state_dict" in mapping and "steps" in (_as_mapping(mapping.get(SWAPPED)) or {})
     for nest in NESTS:
-        nested_state = _state(mapping[nest], depth + 1) if mapping.get(nest) is not None else None
-        if nested_state:
-            return nested_state
-    return None
+        if mapping.get(nest) is None or (is_swapped and nest == SWAPPED):
+            continue
+        choice = _state(mapping[nest], depth + 1)
+        if choice and choice.tensors:
+            is_average = nest in AVERAGES or is_swapped or choice.is_average
+            return _Choice(choice.tensors, (nest, *choice.entry), is_average, _others(mapping, nest) + choice.rest)
+    return _Choice(named_tensors) if named_tensors else None
+
+
+def _others(mapping: Mapping[Any, Any], nest: str) -> tuple[str, ...]:
+    """Return the names of other copies and of states of optimisers in a mapping."""
+    return tuple(
+        key
+        for key, value in mapping.items()
+        if isinstance(key, str) and key != nest and value is not None and (key in NESTS or "optim" in key)
+    )
 
 
 def _module(root: _InertObject) -> list[tuple[str, _StridedTensor]]:

@@ -102,4 +102,7 @@ class Detector(Protocol):
         Returns:
             The losses by name, weighted so that their sum is the loss of the detector's source: scalars for "batch",
             [B] for "image".
+
+        Raises:
+            ConfigError: The detector has no training losses; then its attribute `has_training_losses` is False.
         """

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from ssad.core.errors import ConfigError, FormatError
 from ssad.core.registry import Reference, check_arguments, make, names, resolve
 
 DETECTORS: dict[str, str] = {
@@ -19,12 +20,31 @@ DETECTORS: dict[str, str] = {
     "yolov5n": "ssad.detectors.yolov5:yolov5n",
     "yolov5s": "ssad.detectors.yolov5:yolov5s",
 }
+ONNX = "onnx:"
+"""Before the name of a file: an exported detector (`ssad.detectors.adapters.onnx_detector`)."""
 SHIPPED = Path(__file__).parent / "weights"
 
 
 def detector_names() -> dict[str, str]:
     """Return the origin of every detector, by name."""
     return names("detector", DETECTORS)
+
+
+def resolve_detector(name: str) -> Any:
+    """Return the builder of a detector; that of "onnx:FILE" takes what follows the file's name.
+
+    Args:
+        name: Name of the detector, without arguments.
+
+    Raises:
+        SSADError: See `ssad.core.registry.resolve`; the packages of `onnx:FILE` are not installed.
+    """
+    if not name.startswith(ONNX):
+        return resolve("detector", DETECTORS, name)
+    path = Path(name.removeprefix(ONNX)).expanduser()
+    if not path.is_file():
+        raise FormatError(f"detector '{name}': no file {path}; name one that exists: {ONNX}FILE.onnx")
+    return partial(resolve("detector", {name: "ssad.detectors.adapters.onnx_detector:onnx_detector"}, name), path)
 
 
 def make_detector(
@@ -46,9 +66,11 @@ def make_detector(
         FormatError: The weights cannot be read, or do not fit.
     """
     reference = Reference.parse(name)
-    builder = resolve("detector", DETECTORS, reference.name)
+    builder = resolve_detector(reference.name)
     check_arguments("detector", name, builder, extra_arguments=options)
     name, options = reference.name, {**reference.options, **options}
+    if name.startswith(ONNX) and weights is not None:
+        raise ConfigError(f"detector '{name}': the file holds its weights; it takes no others")
     if name not in DETECTORS:
         detector = make("detector", name, builder, options, ("task", "classes", "predict"))
         return detector.to(device) if hasattr(detector, "to") else detector
@@ -107,7 +129,6 @@ def _classes_of(path: Path) -> dict[str, Any]:
 def _check_hash(path: Path, state: dict[str, Any]) -> None:
     """Raise FormatError unless shipped weights have the hash of their card."""
     from ssad.core.checkpoints import hash_state, read_card
-    from ssad.core.errors import FormatError
 
     if hash_state(state) != read_card(path).hash:
         raise FormatError(f"{path}: not the weights that their card describes (another hash); install SSAD anew")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -307,6 +308,12 @@ def _check_losses(trial: CheckCase) -> None:
         need(not len(image_truth.label) or bool(has_owner.any()), "some place answers for a large object")
     tensors = (assignment.label, *assignment.extra.values())
     need(not any(value.requires_grad for value in tensors), "no gradient flows through assign")
+    if not trial.has_losses:
+        need(
+            bool((detector.assign(dense, trial.truth((0, 0, 0))).owner == -1).all()), "without objects no place has one"
+        )
+        _expect_refusal(trial, "losses of a detector without any", lambda: detector.losses(dense, assignment))
+        return
     batch_losses = detector.losses(dense, assignment)
     image_losses = detector.losses(dense, assignment, reduction="image")
     need(
@@ -374,21 +381,24 @@ def _check_sizes(trial: CheckCase) -> None:
             trial.predict(images.detach())
 
 
+def _expect_refusal(trial: CheckCase, description: str, call: Callable[[], object]) -> None:
+    """Record a fault unless a call raises ConfigError of one line."""
+    try:
+        call()
+    except ConfigError as error:
+        trial.expect("\n" not in str(error), f"{description}: refused in one line")
+    except Exception as error:  # any other exception is the fault in question
+        trial.expect(False, f"{description}: refused with ConfigError, not {type(error).__name__}")
+    else:
+        trial.expect(False, f"{description}: refused with ConfigError")
+
+
 def _check_refusals(trial: CheckCase) -> None:
     images, detector = trial.images(1), trial.detector
     intrinsic = trial.intrinsics(1)
     dense = trial.dense(images)
 
-    def expect_refusal(description: str, call: Callable[[], object]) -> None:
-        try:
-            call()
-        except ConfigError as error:
-            trial.expect("\n" not in str(error), f"{description}: refused in one line")
-        except Exception as error:  # any other exception is the fault in question
-            trial.expect(False, f"{description}: refused with ConfigError, not {type(error).__name__}")
-        else:
-            trial.expect(False, f"{description}: refused with ConfigError")
-
+    expect_refusal = partial(_expect_refusal, trial)
     for description, bad_images in (
         ("greyscale images", images[:, :1]),
         ("a single image without a batch", images[0]),

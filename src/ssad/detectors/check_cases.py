@@ -51,6 +51,11 @@ class CheckCase:
         """True if the detector returns 3D boxes."""
         return bool(self.detector.task == "3d")
 
+    @property
+    def has_losses(self) -> bool:
+        """True unless the detector says that it has no training losses."""
+        return bool(getattr(self.detector, "has_training_losses", True))
+
     def device(self) -> torch.device:
         """Return the device of the detector's weights."""
         for module in modules_of(self.detector):

@@ -75,7 +75,7 @@ class Loop:
                 raise ConfigError(
                     f"an actor follows the policy '{name}': say who makes drivers, policies=ssad.make_system"
                 )
-            self.drivers.append((_policy_selector(simulator, name, len(self.drivers)), policies(name)))
+            self.drivers.append((_PolicySelector(simulator, name, len(self.drivers)), policies(name)))
         self.sensors = SENSORS | dict(sensors or {})
         self._image_change = None if isinstance(perturbation, LoopChanges | Mapping | None) else perturbation
         if isinstance(perturbation, LoopChanges):
@@ -326,17 +326,21 @@ class _Readings(Mapping[str, Any]):
         self._open = False
 
 
-def _policy_selector(simulator: Simulator, policy: str, number: int) -> Selector:
-    """Return a selector of the agents that follow a policy by their episode and that no other driver controls."""
-    follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
-    for row, episode in zip(follows_policy, simulator.episodes, strict=True):
-        row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
+class _PolicySelector:
+    """Selector of the agents that follow a policy by their episode and that no other driver controls.
 
-    def choose(state: WorldState) -> Bool:
-        free = (state.policy < 0) | (state.policy == number)
-        return np.asarray(follows_policy[simulator.assigned] & free & state.active)
+    It is an object and no closure, so that the copy of a loop asks the copy of its simulator.
+    """
 
-    return choose
+    def __init__(self, simulator: Simulator, policy: str, number: int) -> None:
+        self._simulator, self._number = simulator, number
+        self._follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
+        for row, episode in zip(self._follows_policy, simulator.episodes, strict=True):
+            row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
+
+    def __call__(self, state: WorldState) -> Bool:
+        free = (state.policy < 0) | (state.policy == self._number)
+        return np.asarray(self._follows_policy[self._simulator.assigned] & free & state.active)
 
 
 def _check_believer(simulator: Simulator, selector: int | Selector, driver: Driver) -> None:

@@ -80,9 +80,9 @@ class OneStage(Adapter):
         """
         size = check_images(self.name, images)
         # The model's own transform normalises and resizes, so weights see the input they were trained with.
-        batch, _ = self.model.transform(list(images.to(next(self.model.parameters()).dtype)))
-        features = list(self.model.backbone(batch.tensors).values())
-        heads = {name: to_full_precision(value) for name, value in self.model.head(features).items()}
+        batch, _ = self.model.transform(list(images.to(self._dtype())))
+        features, outputs = self._outputs(batch.tensors)
+        heads = {name: to_full_precision(value) for name, value in outputs.items()}
         anchors = to_full_precision(self.model.anchor_generator(batch, features)[0])
         scale = input_scale(batch.image_sizes[0], size, anchors)
         level, stride = self._levels(features, batch.tensors.shape[2], anchors.device)
@@ -98,6 +98,16 @@ class OneStage(Adapter):
             features=tuple(features),
             size=size,
         )
+
+    def _dtype(self) -> torch.dtype:
+        """Return the type of the weights."""
+        dtype: torch.dtype = next(self.model.parameters()).dtype
+        return dtype
+
+    def _outputs(self, tensors: Tensor) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Return the maps before the head, and what the head returns."""
+        features = list(self.model.backbone(tensors).values())
+        return features, self.model.head(features)
 
     def choose(self, dense: Dense, min_score: float) -> list[Detections]:
         """Return the detections above a score, selected as in torchvision.

@@ -35,12 +35,11 @@ from ssad.detectors.adapters.common import (
     Adapter,
     check_images,
     check_truth,
-    labels_and_owners,
     resize_and_pad,
     resized_size,
     sum_by_image,
 )
-from ssad.detectors.yolo.assign import Targets
+from ssad.detectors.adapters.task_aligned import assign_by_alignment
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import select
 from ssad.detectors.yolo.loss import ciou
@@ -48,7 +47,6 @@ from ssad.detectors.yolo.loss import ciou
 GREY = 114 / 255
 NMS_IOU, MAX_DETECTIONS, THRESHOLD = 0.7, 300, 0.25  # its published defaults for predictions
 BOX_GAIN, CLASS_GAIN, DFL_GAIN = 7.5, 0.5, 1.5  # and for training
-TOP, ALPHA, BETA = 10, 0.5, 6.0  # of the task-aligned assignment
 INSTALL = f"{install_extra('ultralytics')} (licence AGPL-3.0; not a dependency of SSAD)"
 
 
@@ -200,49 +198,10 @@ class Ultralytics(Adapter):
         """
         scale = self._scale(dense.size, dense.box.device).to(dense.box)
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
-        rows = [self._assign_one(dense, targets, image_index, scale) for image_index in range(len(truth))]
-        label, owner, box, weight = (torch.stack(column) for column in zip(*rows, strict=True))
+        label, owner, box, weight = assign_by_alignment(
+            dense.logit.sigmoid(), dense.box * scale, dense.place * scale[:2], targets
+        )
         return Assignment(label, owner, tuple(truth), {"box": box / scale, "weight": weight})
-
-    def _assign_one(
-        self, dense: Dense, targets: Targets, image_index: int, scale: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return label, owner, box and weight of the places of an image."""
-        object_count = int(targets.real[image_index].sum())
-        predicted, place = dense.box[image_index] * scale, dense.place * scale[:2]
-        no_owner = torch.full(place.shape[:1], -1, dtype=torch.int64, device=place.device)
-        if not object_count:
-            return no_owner, no_owner, torch.zeros_like(predicted), torch.zeros_like(predicted[:, 0])
-        box, object_labels, crowd = (
-            targets.box[image_index, :object_count],
-            targets.label[image_index, :object_count],
-            targets.crowd[image_index, :object_count],
-        )
-        is_inside = torch.cat((place[:, None] - box[:, :2], box[:, 2:] - place[:, None]), -1).amin(-1) > 1e-9
-        pair_shape = (len(place), object_count, 4)
-        overlap = (
-            ciou(predicted[:, None].expand(pair_shape).reshape(-1, 4), box.expand(pair_shape).reshape(-1, 4))
-            .clamp(min=0)
-            .view(len(place), object_count)
-        )
-        overlap = overlap * is_inside
-        alignment = dense.logit[image_index].sigmoid()[:, object_labels] ** ALPHA * overlap**BETA
-        best_cells = alignment.topk(min(TOP, len(place)), 0).indices
-        is_claimed = torch.zeros_like(is_inside).scatter_(0, best_cells, True) & is_inside
-        claim_overlap = torch.where(is_claimed, overlap, -1.0)
-        claim_overlap[is_claimed.sum(1) > 1] = overlap[
-            is_claimed.sum(1) > 1
-        ]  # the most overlap of all, as the source does
-        owner = torch.where(is_claimed.any(1), claim_overlap.argmax(1), -1)
-        index = owner.clamp(min=0)
-        is_owned = functional.one_hot(index, object_count).bool() & (owner >= 0)[:, None]
-        owned_alignment = torch.where(is_owned, alignment, 0.0)
-        # TOOD: the best place of an object gets its largest overlap as target score.
-        normaliser = torch.where(is_owned, overlap, 0.0).amax(0) / (owned_alignment.amax(0) + 1e-9)
-        weight = (owned_alignment * normaliser).amax(1)
-        label, owner = labels_and_owners(owner, object_labels, crowd)
-        is_object = label >= 0
-        return label, owner, torch.where(is_object[:, None], box[index], 0.0), torch.where(is_object, weight, 0.0)
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"

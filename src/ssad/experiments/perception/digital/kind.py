@@ -14,12 +14,14 @@ from ssad.core.errors import ConfigError
 from ssad.core.registry import split_weights
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
+from ssad.detectors import ONNX
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources
 from ssad.experiments.perception.digital import page
 from ssad.experiments.perception.digital.attack_record import attack_record
 from ssad.experiments.perception.digital.attack_sheet import attack_sheet
 from ssad.experiments.perception.digital.points import (
     AttackTable,
+    Method,
     bystander_points,
     guard_of,
     hardened_points,
@@ -54,6 +56,12 @@ class DigitalSuite(DetectorSuite, AttackTable):
     kind: Literal["digital"]
     transfer_detectors: list[str] = Field(default=[])
     hardened: list[str] = Field(default=[])
+
+    def loss_of(self, method: Method) -> str:
+        """Return the loss of an attack: `vanish` in place of the training loss beside exports, which have none."""
+        loss = super().loss_of(method)
+        has_export = any(name.startswith(ONNX) for name in (*self.detectors, *self.hardened, *self.transfer_detectors))
+        return "vanish" if has_export and not method.loss and loss == "full" else loss
 
 
 class Digital(OpenLoopKind):

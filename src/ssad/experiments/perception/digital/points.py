@@ -160,6 +160,10 @@ class AttackTable(Schema):
         """Turn a bare name into an entry with default settings."""
         return named(value)
 
+    def loss_of(self, method: Method) -> str:
+        """Return the loss that an attack of the table ascends."""
+        return method.loss or default_loss(method.name)
+
 
 @dataclass(frozen=True)
 class Guarded:
@@ -296,7 +300,7 @@ def rows_of(suite: AttackTable) -> list[AttackPoint]:
             for name in [*classes, *entry.becomes, *entry.becomes.values()]:
                 if name not in MMDET3D_CLASSES:
                     raise unknown_name("class", name, MMDET3D_CLASSES)
-            if becomes and (entry.loss or default_loss(entry.name)) != "mislabel":
+            if becomes and suite.loss_of(entry) != "mislabel":
                 raise ConfigError(f"suite {suite.name}: attack {entry.name}: becomes needs loss: mislabel")
             spec = replace(
                 _spec(suite, entry, entry.radius, entry.steps),
@@ -342,13 +346,18 @@ def points_of(suite: AttackTable) -> list[AttackPoint]:
         for point in rows
         if point.defence
     ]
-    return _with_controls([*rows, *sweep_points, *undefended_points, *transfer_points])
+    return _with_controls(suite, [*rows, *sweep_points, *undefended_points, *transfer_points])
 
 
-def _with_controls(points: Sequence[AttackPoint]) -> list[AttackPoint]:
+def _with_controls(suite: AttackTable, points: Sequence[AttackPoint]) -> list[AttackPoint]:
     """Return the clean data and noise that points are compared with, and then the points, each once."""
     noise_points = [
-        replace(point, specs=(AttackSpec("noise", default_loss("noise"), point.specs[0].norm, point.specs[0].radius),))
+        replace(
+            point,
+            specs=(
+                AttackSpec("noise", suite.loss_of(Method(name="noise")), point.specs[0].norm, point.specs[0].radius),
+            ),
+        )
         for point in points
         if point.defence is None
     ]
@@ -374,7 +383,9 @@ def hardened_points(suite: AttackTable) -> list[AttackPoint]:
         ConfigError: An attack does not exist or refuses a setting.
     """
     over_radii = [selected.model_copy(update={"steps": []}) for selected in suite.sweeps if selected.radii]
-    return _with_controls([*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)])
+    return _with_controls(
+        suite, [*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)]
+    )
 
 
 def transfers_of(suite: AttackTable) -> list[AttackPoint]:
@@ -395,7 +406,7 @@ def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int |
     options = dict(method.options)
     if steps is not None or has_option(method.name, "steps"):
         options.setdefault("steps", suite.steps if steps is None else steps)
-    loss = method.loss or default_loss(method.name)
+    loss = suite.loss_of(method)
     make_objective(loss)
     norm: Norm = method.norm
     radius_value = suite.radius if radius is None else radius
