@@ -26,7 +26,19 @@ from ssad.engine.kind import Kind, SuiteBase
 from ssad.experiments.suites import KINDS, kind_of
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
-STABLE = ("suites", "kinds", "generators", "systems", "detectors", "recipes", "shifts", "attacks")
+STABLE = (
+    "suites",
+    "kinds",
+    "generators",
+    "systems",
+    "simulators",
+    "detectors",
+    "recipes",
+    "shifts",
+    "attacks",
+    "losses",
+    "defences",
+)
 """Lists of `ssad list` that depend on the installed package alone, not on what has been imported."""
 KINDS_OF_VALUE = {"str": "text", "int": "integer", "float": "number"}
 BOUNDS = {"ge": "at least {}", "gt": "more than {}", "le": "at most {}", "lt": "less than {}"}

@@ -73,7 +73,7 @@ def in_torch(picture: Any, repeats: int) -> dict[str, dict[str, float]]:
     for name, (sensor, quality) in TORCH.items():
         noise = draw_noise(radiance.shape[:3], sensor, torch.Generator().manual_seed(0))
         window = ChangedWindow.around(taps.pixel, radiance.shape[:3], sensor, quality=quality)
-        part, part_noise, part_taps = window.crop(radiance), window.crop(noise), window.taps(taps)
+        part, part_noise, part_taps = window.crop(radiance), window.crop(noise), window.relative_taps(taps)
 
         def whole(sensor: SensorModel = sensor, quality: int | None = quality, noise: torch.Tensor = noise) -> None:
             leaf = texture.clone().requires_grad_()

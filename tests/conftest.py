@@ -155,7 +155,6 @@ def tiny_set(shared: Shared) -> Path:
 @pytest.fixture(scope="session")
 def carla_home(shared: Shared, data_dir: Path) -> Path:
     """An $SSAD_HOME into which CARLA's maps and SafeBench's and FREA's routes were imported by `ssad import`."""
-    pytest.importorskip("carla", reason="reading OpenDRIVE needs the extra carla")
     from helpers.command import ssad
 
     def make(home: Path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +15,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.types import Actor, Phase, PhaseTrigger, Pose
 from ssad.envs import episodes_of, make_sb3
+from ssad.scenarios.dynamic import load_scenarios
+from ssad.scenarios.dynamic.yamlio import save_scenarios
 
 ID = "ssad.envs:SSAD/Driving-v0"
 
@@ -38,6 +44,57 @@ def test_make_vec_runs_the_scenarios_in_one_batch() -> None:
         ends |= {e for e in info.get("end", []) if e}
         assert not (terminated & truncated).any()
     assert "collision" in ends
+
+
+@pytest.mark.parametrize("observation", ["safebench", "traffic"])
+def test_a_tree_search_copies_the_environment(observation: str) -> None:
+    """Copies of what `gymnasium.make` returns step alike to the bit, also through its wrappers."""
+    env = gymnasium.make(ID, scenarios="precrash", observation=observation)
+    env.reset(seed=1, options={"scenario": "RightTurn/01"})
+    action = np.array([0.4, 0.02], np.float32)
+    for _ in range(12):
+        env.step(action)
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(25):
+        expected = env.step(action)
+        for duplicate in copies:
+            found = duplicate.step(action)
+            np.testing.assert_array_equal(found[0], expected[0])
+            assert found[1:] == expected[1:]
+    assert copies[0].unwrapped.world.hashes() == env.unwrapped.world.hashes()
+    draws = [other.reset()[1]["episode"] for other in (env, *copies)]
+    assert draws == [draws[0]] * 3
+
+
+def test_a_copy_drives_adversaries_and_policies_on(tmp_path: Path) -> None:
+    """Drivers of other agents go with the copy: selected ones, and those that scenarios name."""
+    from ssad.scenarios.dynamic.policy.adv_ppo import Adversary
+    from ssad.world.selection import FreaSelection
+
+    (scenario,) = load_scenarios("LaneChanging/00")
+    path = ((257.0, -5.25), (317.0, -5.25))
+    moving = (Phase(6.0, PhaseTrigger("time", 0.0)),)
+    actors = (
+        Actor("policy", "car", Pose(257.0, -5.25), path=path, policy="ppo", target_speed=6.0),
+        Actor("adversary", "car", Pose(229.0, -1.75), path=((229.0, -1.75), (317.0, -1.75)), phases=moving),
+    )
+    custom = replace(scenario, name="own", type="Custom", trigger=None, parameters={}, actors=actors)
+    save_scenarios(tmp_path / "own.yaml", [replace(custom, route=(Pose(217.0, -5.25), Pose(317.0, -5.25)))])
+    references = ["RightTurn/00", str(tmp_path / "own.yaml")]
+    envs = gymnasium.make_vec(ID, num_envs=3, scenarios=references, drivers={FreaSelection(count=1): Adversary()})
+    assert isinstance(envs, gymnasium.vector.VectorEnv)
+    envs.reset(seed=3, options={"scenario": ["own", "RightTurn/00", "own"]})
+    actions = np.tile(np.array([0.3, 0.0], np.float32), (3, 1))
+    for _ in range(10):
+        envs.step(actions)
+    world = envs.unwrapped.world
+    assert world.state().policy[0].tolist() == [-1, 1, 0], "the policy of the scenario, and the adversary, drive"
+    duplicate = copy.deepcopy(envs)
+    for _ in range(40):
+        envs.step(actions)
+    for _ in range(40):
+        duplicate.step(actions)
+    assert world.hashes() == duplicate.unwrapped.world.hashes()
 
 
 def test_unknown_scenarios_are_named() -> None:
@@ -129,6 +186,12 @@ def test_stable_baselines3_trains_on_the_scenes_of_one_batch() -> None:
     assert isinstance(env, VecEnv)
     env.seed(5)
     plain = gymnasium.make_vec(ID, num_envs=8, scenarios=["LaneChanging", "RightTurn"], observation="frea")
+    np.testing.assert_array_equal(env.reset(), plain.reset(seed=5)[0])
+    env.set_options({"scenario": "RightTurn/01"})
+    chosen = plain.reset(options={"scenario": "RightTurn/01"})
+    np.testing.assert_array_equal(env.reset(), chosen[0])
+    assert len(set(chosen[1]["episode"].tolist())) == 1
+    env.seed(5)
     np.testing.assert_array_equal(env.reset(), plain.reset(seed=5)[0])
     total, length, ended = np.zeros(8), np.zeros(8, int), np.zeros(8, int)
     actions = np.tile(np.array([1.0, 0.0], np.float32), (8, 1))

@@ -14,6 +14,7 @@ import pytest
 import torch
 from helpers.command import ssad
 from helpers.run_folder import driving_lines, write_run
+from PIL import Image
 
 from ssad.core.detections import Detections, Solids
 from ssad.core.errors import ConfigError
@@ -123,6 +124,76 @@ def test_detect_draws_boxes_and_lists_them(mine: Path) -> None:
     wrong = ssad("detect", "street.png", "out", "--split", "val")
     assert (wrong.returncode, wrong.stderr) == (2, "error: --split cannot be used with pictures\n")
     assert "no such file" in ssad("detect", "nowhere.png", "out").stderr
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    """Pictures of several formats, one turned by its EXIF and one broken, and a point cloud."""
+    root, street = tmp_path / "photographs", np.full((120, 200, 3), 90, np.uint8)
+    street[:60, :100] = (250, 60, 60)
+    (root / "more").mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(street).save(root / "turned.jpg", exif=exif)
+    Image.fromarray(street).convert("L").save(root / "grey.png")
+    Image.fromarray(street).save(root / "more" / "same.bmp")
+    Image.fromarray(street).save(root / "more" / "same.tif")
+    (root / "broken.png").write_bytes(b"nothing")
+    (root / "outside.png").symlink_to("/etc/hostname")
+    (root / "scan.pcd").write_text(
+        "# .PCD\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nDATA ascii\n9 9 0\n-9 -9 0\n"
+    )
+    (root / "notes.txt").write_text("nothing to see")
+    return root
+
+
+def test_detect_takes_a_folder_of_photographs_upright_and_whole(mine: Path, photographs: Path) -> None:
+    done = ssad("detect", photographs, "out", "--detector", f"{mine.name}:Finder?side=40", "--device", "cpu")
+    assert done.returncode == 1
+    assert "out/turned.jpg: 1 boxes; turned upright (EXIF orientation 6)\n" in done.stdout
+    assert "out/grey.jpg: 1 boxes; greyscale repeated to three channels\n" in done.stdout
+    assert "not read: broken.png: not a JPEG, PNG" in done.stdout
+    assert "not read: outside.png: a symbolic link that leads out of" in done.stdout
+    rows = json.loads(Path("out/detections.json").read_text())
+    assert sorted(rows) == ["grey.png", "more/same.bmp", "more/same.tif", "turned.jpg"]
+    assert sorted(path.relative_to("out").as_posix() for path in Path("out").rglob("*.jpg")) == [
+        "grey.jpg",
+        "more/same.bmp.jpg",
+        "more/same.tif.jpg",
+        "turned.jpg",
+    ]
+    upright = read_image("out/turned.jpg")
+    assert upright.shape == (200, 120, 3)
+    assert upright[:80, 70:, 0].mean() > 200, "the red corner is at the top right"
+    (photographs / "broken.png").unlink()
+    (photographs / "outside.png").unlink()
+    assert ssad("detect", photographs, "two", "--detector", f"{mine.name}:Finder", "--device", "cpu").returncode == 0
+
+
+def test_show_takes_photographs_upright_and_whole(photographs: Path, tmp_path: Path) -> None:
+    done = ssad("show", photographs, tmp_path / "page")
+    assert done.returncode == 1
+    assert f"page: {tmp_path / 'page' / 'index.html'} (5 of 7 pictures and point clouds)\n" in done.stdout
+    assert "not read: broken.png: not a JPEG, PNG" in done.stdout
+    page = (tmp_path / "page" / "index.html").read_text()
+    for text in (
+        "turned.jpg: 120 x 200; turned upright (EXIF orientation 6)",
+        "scan.pcd: 2 points",
+        "broken.png: not a",
+    ):
+        assert text in page
+    assert "notes.txt" not in page
+    images = [read_image(tmp_path / "page" / name) for name in re.findall(r'src="(pictures/[^"]+)"', page)]
+    assert len(images) == 5
+    (upright,) = [image for image in images if image.shape[0] > image.shape[1]]
+    assert upright[:400, 400:, 0].mean() > 200
+    (above,) = [image for image in images if image.shape[0] == image.shape[1]]
+    assert above[:300, :300].max() > 80, "a point ahead and to the left"
+    assert above[350:, 350:].max() > 80, "a point behind and to the right"
+    assert above[:300, 350:].max() < 60
+    alone = ssad("show", photographs / "turned.jpg", tmp_path / "alone")
+    assert (alone.returncode, "1 of 1 pictures" in alone.stdout) == (0, True)
+    assert "--scenes is for a nuScenes folder" in ssad("show", photographs, tmp_path / "x", "--scenes", "a").stderr
 
 
 class Ahead:

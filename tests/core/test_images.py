@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ssad.core import images
+from ssad.core import image_files
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import add_caption, decode_image, encode_jpeg, read_image, save_picture
 
@@ -36,23 +36,15 @@ def png(image: Any) -> bytes:
     return bytes(cv2.imencode(".png", image)[1])
 
 
-def grey_jpeg(image: Any) -> bytes:
-    return bytes(cv2.imencode(".jpg", image)[1])
-
-
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
         ("half.jpg", encode_jpeg(picture(), 90)[:-300], "truncated JPEG"),
         ("tail.jpg", encode_jpeg(picture(), 90)[:-2], "truncated JPEG"),
         ("head.jpg", encode_jpeg(picture(), 90)[:40], "truncated JPEG"),
-        ("grey.jpg", grey_jpeg(picture()[:, :, 0]), "greyscale"),
         ("half.png", png(picture())[:-100], "truncated PNG"),
         ("flip.png", png(picture())[:60] + b"\x00" + png(picture())[61:], "checksum"),
-        ("grey.png", png(picture()[:, :, 0]), "greyscale"),
-        ("deep.png", png(picture().astype(np.uint16) * 257), "16 bits"),
-        ("alpha.png", png(np.dstack([picture(), picture()[:, :, :1]])), "alpha"),
-        ("text.jpg", b"hello", "not a JPEG or PNG"),
+        ("text.jpg", b"hello", "not a JPEG, PNG, TIFF, BMP, WebP or PNM image"),
         ("empty.jpg", b"", "is empty"),
     ],
 )
@@ -92,8 +84,6 @@ def test_a_png_is_read_to_its_end_and_no_further() -> None:
     ):
         with pytest.raises(FormatError, match="its end is missing"):
             decode_image(data)
-    with pytest.raises(FormatError, match="greyscale"):
-        decode_image(plain_png(5, 4, colour=4))
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg"])
@@ -101,25 +91,13 @@ def test_pictures_over_the_limit_are_refused_before_they_are_unpacked(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = plain_png(8, 4) if kind == "png" else encode_jpeg(np.zeros((4, 8, 3), np.uint8))
-    monkeypatch.setattr(images, "MAX_PIXELS", 32)
+    monkeypatch.setattr(image_files, "MAX_PIXELS", 32)
     assert decode_image(data, "it").shape == (4, 8, 3)
-    monkeypatch.setattr(images, "MAX_PIXELS", 31)
+    monkeypatch.setattr(image_files, "MAX_PIXELS", 31)
     with pytest.raises(FormatError, match="it: 8 x 4 pixels are more than the limit of 31"):
         decode_image(data, "it")
-    with pytest.raises(FormatError, match="70000 x 70000 pixels"):
+    with pytest.raises(FormatError, match="more pixels than the limit"):
         decode_image(plain_png(70_000, 70_000))
-
-
-def test_printers_colours_are_refused() -> None:
-    """A JPEG of four inks."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    file = BytesIO()
-    Image.new("CMYK", (16, 16)).save(file, "JPEG")
-    with pytest.raises(FormatError, match=r"a (CMYK|YCCK) image; RGB colours are needed"):
-        decode_image(file.getvalue())
 
 
 def test_a_higher_quality_is_nearer_and_444_keeps_colours_apart() -> None:
@@ -166,3 +144,13 @@ def test_pictures_are_saved_by_the_name_of_the_file(tmp_path: Path) -> None:
         save_picture(tmp_path / "a.gif", image)
     with pytest.raises(StoreError):
         save_picture(tmp_path / "a.jpg" / "b.png", image)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_image_that_was_read_can_be_drawn_on(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "image.png"
+    cv2.imwrite(str(path), np.zeros((9, 16, channels), np.uint8))
+    image = read_image(path)
+    image[0, 0] = (1, 2, 3)
+    assert image.shape == (9, 16, 3)
+    assert image[0].sum() == 6

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ssad.core.source import source_files, source_version
+from ssad.core.source import plugin_version, source_files, source_version
 from ssad.experiments.driving.kind import Driving
 from ssad.experiments.perception.shifts.kind import Detection
 
@@ -203,3 +203,24 @@ def test_any_changed_file_that_is_led_to_changes_the_version(tmp_path: Path, mon
         assert (source_version("one") != before) == (name != "four.py"), name
         (tmp_path / name).write_text(text)
         assert source_version("one") == before
+
+
+def test_of_an_installed_package_its_own_source_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = tmp_path / "site-packages"
+    (site / "own_p").mkdir(parents=True)
+    (site / "own_p" / "__init__.py").write_text("")
+    (site / "own_p" / "thing.py").write_text("import own_torch\nfrom own_p import near\n")
+    (site / "own_p" / "near.py").write_text("")
+    (site / "own_torch.py").write_text("")
+    monkeypatch.syspath_prepend(str(site))
+    assert led_to("own_p.thing") == {"own_p.thing", "own_p.near"}
+
+
+def test_the_version_of_a_plugin_is_that_of_the_module_which_offers_it(write: Write) -> None:
+    table = {"blind": "ssad.drivers.builtin:Blind"}
+    assert plugin_version("system", table, "blind?x=1@mine") == ""
+    write({"own_q.py": "from ssad.drivers.builtin import Blind\nOBJECT = Blind()\n"})
+    first = plugin_version("system", table, "own_q:OBJECT?x=1@mine")
+    assert first == source_version("own_q"), "the class of the object is SSAD's, the object is not"
+    write({"own_q.py": "from ssad.drivers.builtin import Blind\nOBJECT = Blind()  # edited\n"})
+    assert plugin_version("system", table, "own_q:OBJECT") != first

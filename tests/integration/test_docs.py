@@ -59,6 +59,10 @@ GROUPS = {
     "ssad.lights",
     "ssad.faults",
     "ssad.perturbations",
+    "ssad.losses",
+    "ssad.defences",
+    "ssad.simulators",
+    "ssad.physical",  # -attacks
     "ssad.perceivers",
     "ssad.trackers",
     "ssad.planners",

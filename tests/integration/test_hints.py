@@ -14,7 +14,7 @@ import typer
 
 from ssad.cli import app
 from ssad.cli.listing import LISTS
-from ssad.core.errors import LISTED, MissingExtraError, install_extra, unknown_name
+from ssad.core.errors import LISTED, MissingExtraError, install_extra, plural, unknown_name
 from ssad.core.safeio import parse_yaml
 from ssad.core.version import __version__
 
@@ -54,7 +54,7 @@ def test_the_hint_for_an_unknown_name_shows_all_names_or_a_list_that_exists(noun
 
 
 def test_what_can_be_listed_is_what_hints_name() -> None:
-    assert {f"{noun}s" for noun in LISTED} == set(LISTS)
+    assert set(map(plural, LISTED)) == set(LISTS)
 
 
 def test_every_list_that_source_and_pages_name_exists() -> None:

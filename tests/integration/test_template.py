@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from helpers.command import ssad
-
-FOLDER = Path(__file__).resolve().parents[2] / "templates" / "ssad-plugin"
-PROJECT = tomllib.loads((FOLDER / "pyproject.toml").read_text())["project"]
+from helpers.template import FOLDER, PROJECT, installed_template
 
 
 @pytest.fixture(autouse=True)
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Its modules on the path, and metadata with the entry points of its pyproject.toml: no build, no network."""
-    info = tmp_path / "ssad_example-0.1.0.dist-info"
-    info.mkdir()
-    groups = PROJECT["entry-points"]
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PROJECT['name']}\nVersion: {PROJECT['version']}\n")
-    (info / "entry_points.txt").write_text(
-        "\n".join(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in names.items()) for group, names in groups.items())
-    )
-    for folder in (tmp_path, FOLDER / "src"):
-        monkeypatch.syspath_prepend(folder)
-    yield
-    for name in [name for name in sys.modules if name.partition(".")[0] == "ssad_example"]:
-        del sys.modules[name]
+def installed(tmp_path: Path) -> Iterator[None]:
+    """The template, installed."""
+    with installed_template(tmp_path / "site"):
+        yield
 
 
 def its_tests() -> ModuleType:
@@ -42,12 +28,13 @@ def its_tests() -> ModuleType:
     return module
 
 
-GROUPS = ["systems", "perceivers", "trackers", "detectors", "attacks", "generators", "scenarios", "kinds"]
+LISTS = {"physical-attacks": "attacks", "lights": "attacks", "faults": "perturbations"}
+GROUPS = [group.removeprefix("ssad.") for group in PROJECT["entry-points"]]
 
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_its_names_are_listed(group: str) -> None:
-    done = ssad("list", group)
+    done = ssad("list", LISTS.get(group, group))
     assert done.returncode == 0, done.stderr
     listed = [line.split()[0] for line in done.stdout.splitlines()]
     assert set(PROJECT["entry-points"][f"ssad.{group}"]) <= set(listed)

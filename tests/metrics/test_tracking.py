@@ -74,7 +74,7 @@ def tracker_frames() -> list[TrackedFrame]:
             no_objects(),
             scene=np.zeros(n, np.int64),
             place=found,
-            spread=np.tile(0.2 * np.eye(2), (n, 1, 1)),
+            covariance=np.tile(0.2 * np.eye(2), (n, 1, 1)),
             yaw=np.zeros(n),
             size=np.tile([4.5, 1.9], (n, 1)),
             velocity=np.full((n, 2), np.nan),

@@ -33,9 +33,9 @@ def write(path, data):
     safeio.write_atomic(path, data)
 
 parts = PartsFolder(Path(sys.argv[1]), {"towns": ["Twinford"], "seed": 0})
-with parts.held("ssad record"):
+with parts.lock("ssad record"):
     for name in ("a", "b", "c"):
-        if parts.finished(name):
+        if parts.is_finished(name):
             continue
         folder = parts.begin(name)
         for number in range(3):

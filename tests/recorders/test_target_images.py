@@ -37,7 +37,7 @@ from ssad.recorders.target_images import (
     MIN_VISIBLE_SHARE,
     SECONDS,
     TARGET,
-    _body_of_target,
+    _add_target_body,
     record_target_images,
     recorded_views,
 )
@@ -371,7 +371,7 @@ def test_the_named_target_is_the_same_metal_everywhere() -> None:
     found = []
     for key in ("one", "another"):
         objects = SceneObjects(0.1, (key,))
-        body = _body_of_target(objects, target)
+        body = _add_target_body(objects, target)
         found.append(objects.meshes[body.meshes[0]])
         assert body.paint == target.colour
         assert body.size == target.full_size
@@ -567,7 +567,7 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace)
     times = [s.time for s in found]
     assert times[:4] == sorted(times[:4])
     assert len(set(times)) == len(times)
-    way = sorted(s.about["way"] for s in found)
+    way = sorted(s.description["way"] for s in found)
     assert min(np.diff(way)) >= 1.0 - 0.011
     assert shots(float(market.driven[-1])) == []
 

@@ -59,4 +59,8 @@ def test_crowded_points_have_no_names_but_tips() -> None:
     assert ("near" in texts) + ("hidden" in texts) == 1
     assert "<other>" in texts, "the legend has every group"
     assert {title.text for title in figure.iter("title")} == {"near: tip", "far: tip", "hidden: tip"}
+    at_the_top = MetricChange(TableCell(0.1), TableCell(1.0), "highest", "shift", "tip")
+    figure = parsed(change_plot([at_the_top], {}, label="l", x_title="x", y_title="y"))
+    (name,) = (text for text in figure.iter("text") if text.text == "highest")
+    assert float(name.attrib["y"]) > 12, "the name is inside of the figure, which begins at 0"
     assert change_plot([], {}, label="l", x_title="x", y_title="y") == ""

@@ -26,7 +26,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import Actor, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalState
 from ssad.drivers import make_system
-from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
+from ssad.drivers.leaderboard.sensors import camera_of, lidar_of, radar_of
 from ssad.metrics import episode_metrics
 from ssad.rendering.lidar import Lidar
 from ssad.scenarios.dynamic import build_episode, load_scenarios

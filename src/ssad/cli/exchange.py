@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.importing import check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
@@ -25,6 +27,10 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_TEXTURE, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
@@ -41,6 +47,10 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and the picture that a projector shows."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_LIGHT, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
@@ -54,17 +64,43 @@ def import_map(
         Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
     ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Refuse a file with anything doubtful.")] = False,
+    turn_on_red: Annotated[
+        bool | None,
+        typer.Option(
+            "--turn-on-red/--no-turn-on-red",
+            help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
+        ),
+    ] = None,
 ) -> None:
-    """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
+    """Import an OpenDRIVE map (1.4 to 1.8) as a town; say what came in, what was left out, and what is doubtful.
+
+    A page with this report and a picture from above is written too.
+    """
+    paths.check_exists(file)
+    from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
+    from ssad.world.roads.import_page import import_page_path
 
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
-    path = bake(file, town_name, home_folder())
+    report = ImportReport(str(file))
+    path = bake(
+        file,
+        town_name,
+        home_folder(),
+        report=report,
+        strict=strict,
+        turn_on_red=turn_on_red,
+        progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
+    )
     print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
+    for line in report.lines():
+        print(line)
+    print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 
 
 def import_routes(
@@ -113,6 +149,7 @@ def import_drive(
 
     Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
     """
+    paths.check_exists(root)
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
     from ssad.scenarios.dynamic import save_scenarios

@@ -59,12 +59,14 @@ def _suite_list() -> dict[str, str]:
 
 
 def _shift_list() -> dict[str, str]:
+    from ssad.core.registry import names
     from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
 
     notes_by_shift = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
-    return {
+    rows = {
         name: f"{family}: {description}{notes_by_shift.get(name, '')}" for name, (family, description) in KNOWN.items()
     }
+    return rows | names("shift", {}) | {"module:object": "a shift of your own (docs/reference/perturbations.md)"}
 
 
 def _perturbation_list() -> dict[str, str]:
@@ -79,6 +81,7 @@ def _perturbation_list() -> dict[str, str]:
 
 
 def _attack_list() -> dict[str, str]:
+    from ssad.core.registry import names
     from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
     from ssad.scenarios.static.physical import default_carrier, physical_names
     from ssad.scenarios.static.physical.lights import LIGHTS
@@ -97,6 +100,7 @@ def _attack_list() -> dict[str, str]:
     guide = "docs/how-to/paint-a-car.md"
     rows |= {name: f"physical: trains a {default_carrier(name)} ({guide})" for name in physical_names()}
     rows |= dict.fromkeys(LIGHTS, f"physical: light on a target, not on its paint ({guide})")
+    rows |= names("light", {})
     return rows | {"module:object": "an attack of your own (docs/how-to/attack-detectors.md)"}
 
 
@@ -108,6 +112,43 @@ def _generator_list() -> dict[str, str]:
         "module:object": "a generator of your own (docs/how-to/search-for-collisions.md)",
     }
     return generator_list() | templates
+
+
+def _loss_list() -> dict[str, str]:
+    from ssad.core.registry import names
+    from ssad.scenarios.static.digital.objectives import LOSSES, OBJECTIVES, TERMS, Objective
+
+    def describe(name: str, origin: str) -> str:
+        if name not in LOSSES:
+            return origin
+        objective: Objective = OBJECTIVES[name]()
+        if name == "full" or name in TERMS:
+            return "training losses of the detector" + ("" if name == "full" else f": those of {name}")
+        return (type(objective).__doc__ or "").strip().partition("\n")[0].rstrip(".")
+
+    rows = {name: describe(name, origin) for name, origin in names("loss", LOSSES).items()}
+    return rows | {"module:object": "a loss of your own (docs/how-to/attack-detectors.md)"}
+
+
+def _defence_list() -> dict[str, str]:
+    from ssad.core.registry import names, resolve
+    from ssad.scenarios.static.digital.defences import DEFENCES
+
+    rows = {
+        name: resolve("defence", DEFENCES, name).__doc__.strip().partition("\n")[0].rstrip(".")
+        if name in DEFENCES
+        else origin
+        for name, origin in names("defence", DEFENCES).items()
+    }
+    return rows | {"module:object": "a defence of your own (docs/how-to/attack-detectors.md)"}
+
+
+def _simulator_list() -> dict[str, str]:
+    from ssad.core.registry import names
+    from ssad.simulators.closed_loop import SIMULATORS
+
+    rows = names("simulator", SIMULATORS) | {"carla://HOST:PORT": "a CARLA server (docs/how-to/use-carla.md)"}
+    return rows | {"module:object": "a simulator of your own (docs/how-to/drive-agents.md)"}
 
 
 def _detector_list() -> dict[str, str]:
@@ -150,6 +191,9 @@ LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "perturbations": _perturbation_list,
     "shifts": _shift_list,
     "attacks": _attack_list,
+    "losses": _loss_list,
+    "defences": _defence_list,
+    "simulators": _simulator_list,
     "towns": _town_list,
 }
 """What can be listed -> makes its rows: name, and what it is."""

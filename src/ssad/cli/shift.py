@@ -175,11 +175,16 @@ def shift_picture_folder(
     if skipped_shifts:
         print(f"left out, since they need boxes in space: {', '.join(skipped_shifts)}")
     for folder in folders:
-        report = f"{folder.root}: {folder.shifted} pictures shifted, {folder.linked} other files linked unchanged, "
+        report = f"{folder.root}: {folder.shifted} pictures shifted, "
+        report += f"{folder.clouds} point clouds shifted, " if folder.clouds else ""
+        report += f"{folder.linked} other files linked unchanged, "
+        report += f"{folder.labels} of them images in folders of labels, " if folder.labels else ""
         report += f"{100 * folder.applied:.0f} % of the pictures changed"
-        print(report + (f", {len(folder.reasons)} failed" if folder.reasons else ""))
-        for reason in folder.reasons[:3]:
+        print(report + (f", {len(folder.reasons)} failed and left out" if folder.reasons else ""))
+        for reason in folder.reasons[:10]:
             print(f"  {reason}")
+        if len(folder.reasons) > 10:
+            print(f"  ... and {len(folder.reasons) - 10} more: see {folder.root / 'manifest.jsonl'}")
     return int(any(folder.reasons for folder in folders))
 
 

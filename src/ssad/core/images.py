@@ -1,94 +1,93 @@
-"""Image files, fully checked when read and written as bytes; captions. Images are uint8 [H, W, 3] RGB."""
+"""Images as arrays, uint8 [H, W, 3] RGB and upright: read, captioned, and written as pictures of results."""
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
-import simplejpeg
 
 from ssad.core.errors import ConfigError, FormatError
-from ssad.core.safeio import read_bytes, write_atomic
+from ssad.core.image_files import (
+    ImageFile,
+    decode_image_file,
+    encode_jpeg,
+    encode_png,
+    read_image_file,
+    turn_back,
+)
+from ssad.core.safeio import write_atomic
 from ssad.core.types import U8
 
-MAX_PIXELS = 1 << 26
-_PNG = b"\x89PNG\r\n\x1a\n"
+__all__ = [
+    "add_caption",
+    "annotated_pixels",
+    "annotation_orientation",
+    "decode_image",
+    "encode_jpeg",
+    "read_annotated_image",
+    "read_image",
+    "save_picture",
+]
+
 CAPTION_HEIGHT = 26  # pixels
 
 
 def read_image(path: str | Path) -> U8:
-    """Read a JPEG or PNG as uint8 [H, W, 3] RGB.
+    """Read an image file of any supported format as uint8 [H, W, 3] RGB, upright.
+
+    Grey is repeated to three channels, alpha is left out, and 16 bits are rounded to 8.
 
     Raises:
-        FormatError: The file is missing or truncated, is not an image, or is grey, has alpha or 16 bits.
+        FormatError: The file is missing, cut short, broken, too large, or not of a supported format.
     """
-    return decode_image(read_bytes(path), str(path))
+    return read_image_file(path).rgb
 
 
 def decode_image(data: bytes, name: str = "<image>") -> U8:
     """The same from the bytes of a file; `name` is what errors call it."""
-    if data[:3] == b"\xff\xd8\xff":
-        return _decode_jpeg(data, name)
-    if data[: len(_PNG)] == _PNG:
-        return _decode_png(data, name)
-    raise FormatError(f"{name}: not a JPEG or PNG image{' (the file is empty)' if not data else ''}")
+    return decode_image_file(data, name).rgb
 
 
-def _decode_jpeg(data: bytes, name: str) -> U8:
-    try:
-        height, width, colour_space, _ = simplejpeg.decode_jpeg_header(data)
-        if colour_space == "Gray":
-            raise FormatError(f"{name}: a greyscale image; three colour channels are needed")
-        if colour_space in ("CMYK", "YCCK"):
-            raise FormatError(f"{name}: a {colour_space} image; RGB colours are needed")
-        _check_pixels(width, height, name)
-        image: U8 = simplejpeg.decode_jpeg(data, "RGB")  # strict: a file cut short raises
-    except ValueError as error:
-        raise FormatError(f"{name}: a broken or truncated JPEG: {error}") from None
-    return image
+def read_annotated_image(path: str | Path, *, width: int, height: int) -> U8:
+    """Read an image in the frame of its annotations, as uint8 [H, W, 3] RGB.
+
+    Annotations refer to the pixels as the file stores them (the convention of COCO's and nuScenes' tools), unless
+    only the upright pixels have the size that the annotations state.
+
+    Args:
+        path: The file.
+        width: Width that the annotations state, pixels; 0 where they state none.
+        height: Height that they state; 0 where they state none.
+
+    Raises:
+        FormatError: The file cannot be read, or has another size in either frame.
+    """
+    return annotated_pixels(read_image_file(path), width=width, height=height)
 
 
-def _decode_png(data: bytes, name: str) -> U8:
-    """Every chunk's checksum is checked first: OpenCV fills what is missing with grey and says nothing."""
-    position, has_end = len(_PNG), False
-    while position + 12 <= len(data) and not has_end:
-        chunk_size = int.from_bytes(data[position : position + 4], "big")
-        chunk_type, chunk_end = data[position + 4 : position + 8], position + 12 + chunk_size
-        if chunk_end > len(data):
-            break
-        if zlib.crc32(data[position + 4 : chunk_end - 4]) != int.from_bytes(data[chunk_end - 4 : chunk_end], "big"):
-            raise FormatError(
-                f"{name}: a broken PNG: the checksum of its {chunk_type.decode('latin-1')} block is wrong"
-            )
-        if chunk_type == b"IHDR" and chunk_size == 13:
-            width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, position + 8)
-            _check_pixels(width, height, name)
-            if bit_depth == 16:
-                raise FormatError(f"{name}: 16 bits a channel; 8 are needed")
-            if colour_type in (0, 4):
-                raise FormatError(f"{name}: a greyscale image; three colour channels are needed")
-            if colour_type == 6:
-                raise FormatError(f"{name}: it has an alpha channel; save it as JPEG, or as PNG without transparency")
-        position, has_end = chunk_end, chunk_type == b"IEND"
-    if not has_end:
-        raise FormatError(f"{name}: a truncated PNG: its end is missing")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise FormatError(f"{name}: not a readable 8 bit RGB image")
-    return np.ascontiguousarray(image[:, :, ::-1])
+def annotated_pixels(image_file: ImageFile, *, width: int, height: int) -> U8:
+    """The same of a file that is already read."""
+    orientation = annotation_orientation(image_file, width=width, height=height)
+    return np.ascontiguousarray(turn_back(image_file.rgb, orientation))
 
 
-def _check_pixels(width: int, height: int, name: str) -> None:
-    if width * height > MAX_PIXELS:
-        raise FormatError(f"{name}: {width} x {height} pixels are more than the limit of {MAX_PIXELS}")
+def annotation_orientation(image_file: ImageFile, *, width: int, height: int) -> int:
+    """Return the EXIF orientation of the pixels that annotations refer to: 1 if these are the upright ones.
 
-
-def encode_jpeg(image: U8, quality: int = 95, subsampling: str = "420") -> bytes:
-    """Return a JPEG of uint8 [H, W, 3] RGB; subsampling 420 as in the originals, 444 keeps colour noise."""
-    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality, "RGB", subsampling, fastdct=False))
+    Raises:
+        FormatError: The file has another size in either frame.
+    """
+    upright_size = image_file.pixels.shape[1::-1]
+    stored_size = upright_size[::-1] if image_file.orientation > 4 else upright_size
+    if not width or not height or stored_size == (width, height):
+        return image_file.orientation
+    if upright_size == (width, height):
+        return 1
+    raise FormatError(
+        f"{image_file.name}: {stored_size[0]} x {stored_size[1]} pixels, the annotations say {width} x {height}; "
+        "give the images that were annotated"
+    )
 
 
 def add_caption(image: U8, caption: str, width: int) -> U8:
@@ -116,4 +115,4 @@ def save_picture(path: Path, image: U8) -> None:
         return
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: pictures are written as .png or .jpg")
-    write_atomic(path, cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
+    write_atomic(path, encode_png(image))

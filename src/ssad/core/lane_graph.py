@@ -18,6 +18,7 @@ from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
+TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
 
 
@@ -83,6 +84,11 @@ class LaneGraph:
         rule_sign: Sign that rules a lane [R].
         rule_lane: The lane that it rules [R].
         rule_s: Arc length of the stop line on that lane [R].
+        forward: Traffic runs along the road's reference line, as OpenDRIVE measures s [L]; without it, it does so on
+            lanes of negative id, as in right-hand traffic.
+        origin: What is added to x and y to get the coordinates of the map's projection, m [2].
+        left_hand: Traffic keeps to the left [1].
+        turn_on_red: Turns to the near side are allowed on red, after a stop [1].
         length: Length of each lane [L].
         pred_offset: As `succ_offset`, for the lanes that lead to lane i [L+1].
         pred: As `succ`, for the lanes that lead to lane i [E].
@@ -123,11 +129,17 @@ class LaneGraph:
     rule_sign: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
     rule_lane: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
     rule_s: F32 = field(default_factory=lambda: np.zeros(0, np.float32))
+    forward: Bool = field(default_factory=lambda: np.zeros(0, bool))
+    origin: F64 = field(default_factory=lambda: np.zeros(2))
+    left_hand: Bool = field(default_factory=lambda: np.zeros(1, bool))
+    turn_on_red: Bool = field(default_factory=lambda: np.ones(1, bool))
     length: F32 = field(init=False)
     pred_offset: I32 = field(init=False)
     pred: I32 = field(init=False)
 
     def __post_init__(self) -> None:
+        if not len(self.forward):
+            object.__setattr__(self, "forward", np.asarray(self.lane_id) < 0)
         for name, dtype in _DTYPES.items():
             value = np.ascontiguousarray(getattr(self, name), dtype)
             # The caller's array would otherwise become read-only.
@@ -217,8 +229,8 @@ class LaneGraph:
         return left < 0 or self.kind[left] != LaneType.DRIVING
 
     def is_same_direction(self, lane: int, other_lane: int) -> bool:
-        """Return whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
-        return bool(self.lane_id[lane] * self.lane_id[other_lane] > 0 and self.road[lane] == self.road[other_lane])
+        """Return whether two lanes of one road carry traffic the same way."""
+        return bool(self.forward[lane] == self.forward[other_lane] and self.road[lane] == self.road[other_lane])
 
 
 def empty_signal_arrays() -> dict[str, Any]:
@@ -241,7 +253,18 @@ def empty_signal_arrays() -> dict[str, Any]:
 _DTYPES = array_dtypes(LaneGraph)
 _ARRAYS_BY_LENGTH = {
     "P": ("z", "yaw", "width", "s"),
-    "L": ("road", "section", "lane_id", "junction", "speed_limit", "left", "right", "left_marking", "right_marking"),
+    "L": (
+        "road",
+        "section",
+        "lane_id",
+        "junction",
+        "speed_limit",
+        "left",
+        "right",
+        "left_marking",
+        "right_marking",
+        "forward",
+    ),
     "S": ("signal_yaw", "signal_junction", "signal_phase", "signal_virtual"),
     "K": ("stop_signal", "stop_lane", "stop_s"),
     "G": ("sign_kind", "sign_yaw"),
@@ -249,6 +272,8 @@ _ARRAYS_BY_LENGTH = {
 }
 # absent from older files, whose towns have no signs
 _OPTIONAL = frozenset({"sign_kind", "sign_xy", "sign_yaw", "rule_sign", "rule_lane", "rule_s"})
+# stored where they differ from their defaults, so that the bytes of other towns stay the same
+_RARE = ("forward", "origin", "left_hand", "turn_on_red")
 
 
 def _check(graph: LaneGraph) -> None:
@@ -286,6 +311,9 @@ def _check(graph: LaneGraph) -> None:
         is_partition = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
         require(bool(is_partition and (np.diff(value) >= 0).all()), f"{array_name} does not partition its rows")
     require(array_lengths["L"] > 0, "it has no lane")
+    for array_name, rows in (("origin", 2), ("left_hand", 1), ("turn_on_red", 1)):
+        require(getattr(graph, array_name).shape == (rows,), f"{array_name} does not have {rows} rows")
+    require(bool(np.isfinite(graph.origin).all()), "origin holds a number that is not finite")
     require(bool((np.diff(graph.offset) >= 2).all()), "a lane has fewer than two points")
     for array_name, low, high in (
         ("left", -1, array_lengths["L"]),
@@ -321,7 +349,14 @@ def save_graph(graph: LaneGraph, path: Path | str) -> None:
     """
     # A text array, since npz has no place for metadata.
     header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
-    save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
+    defaults = {
+        "forward": graph.lane_id < 0,
+        "origin": np.zeros(2),
+        "left_hand": np.zeros(1, bool),
+        "turn_on_red": np.ones(1, bool),
+    }
+    names = [name for name in _DTYPES if name not in _RARE or not np.array_equal(getattr(graph, name), defaults[name])]
+    save_npz(path, {"header": header} | {name: getattr(graph, name) for name in names})
 
 
 def load_graph(path: Path | str) -> LaneGraph:
@@ -338,7 +373,9 @@ def load_graph(path: Path | str) -> LaneGraph:
     header = arrays.pop("header", None)
     if header is None or header.shape != (2,) or str(header[0]) != f"ssad-lane-graph {FORMAT}":
         raise MapError(f"{source}: not a baked town of format {FORMAT}; {remedy}")
-    wrong_names = ", ".join(sorted((set(_DTYPES) - _OPTIONAL - set(arrays)) | (set(arrays) - set(_DTYPES))))
+    wrong_names = ", ".join(
+        sorted((set(_DTYPES) - _OPTIONAL - set(_RARE) - set(arrays)) | (set(arrays) - set(_DTYPES)))
+    )
     if wrong_names:
         raise MapError(f"{source}: missing or unknown arrays: {wrong_names}; {remedy}")
     for name, value in arrays.items():

@@ -19,7 +19,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, unknown_name
+from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, plural, unknown_name
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,15 @@ def make(kind: str, name: str, target: Any, options: Mapping[str, Any], required
         The object.
 
     Raises:
-        ConfigError: Its maker raises, or it lacks an attribute or a method.
+        ConfigError: Its maker raises, it lacks an attribute or a method, or an object gets arguments.
     """
+    # A loss or a defence is called itself: what has all members already is the object, and makes none.
+    is_object = not isinstance(target, type) and all(hasattr(target, member) for member in required_members)
+    is_maker = callable(target) and not (required_members and is_object)
+    if options and not is_maker:
+        raise ConfigError(f"{kind} '{name}': it is an object, which takes no arguments; name its class instead")
     try:
-        instance = target(**options) if callable(target) else target
+        instance = target(**options) if is_maker else target
     except SSADError:
         raise
     except Exception as error:
@@ -189,12 +194,17 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
         except ModuleNotFoundError as error:
             # Torch and others are optional; name the extra instead of the module.
             raise missing_extra(error, f"{kind} '{name}'") or error from None
-    plugins = {point.name: point for point in entry_points(group=f"ssad.{kind}s")}
+    plugins = {point.name: point for point in entry_points(group=group_of(kind))}
     if name in plugins:
         return _import(kind, name, plugins[name].value)
     if ":" in name:
         return _import(kind, name, name)
     raise unknown_name(kind, name, [*table, *plugins])
+
+
+def group_of(kind: str) -> str:
+    """Return the group of entry points of a kind of object: "system" -> "ssad.systems", "loss" -> "ssad.losses"."""
+    return f"ssad.{plural(kind)}"
 
 
 def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
@@ -207,7 +217,7 @@ def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
     Returns:
         Name -> "module:object", built-in ones first.
     """
-    plugins = {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+    plugins = {point.name: point.value for point in entry_points(group=group_of(kind))}
     return dict(table) | {name: origin for name, origin in plugins.items() if name not in table}
 
 

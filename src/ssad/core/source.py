@@ -6,10 +6,11 @@ import ast
 import hashlib
 import importlib.util
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+from ssad.core.registry import Reference, names, resolve
 from ssad.core.seeding import digest
 
 Import = tuple[int, str, tuple[str, ...]]
@@ -18,6 +19,9 @@ Import = tuple[int, str, tuple[str, ...]]
 _START = re.compile(r"(?:^|[:;])[ \t]*((?:from|import)\b)", re.MULTILINE)
 _BRACKET = re.compile(r"from\b[\s.\w\\]+\bimport[\s\\]*\((?:[^)#]|#[^\n]*+)*+$")  # opened and not closed
 _STRING = re.compile(r"""["'](\w+(?:\.\w+)+)(?::\w+)?["']""")  # "package.module:object", as tables of names have it
+
+INSTALLED = ("site-packages", "dist-packages")
+"""Names of folders of installed packages: all that a module imports lies beside it there, numpy and torch included."""
 
 
 def source_version(module: str, *, excluded_modules: Sequence[str] = ()) -> str:
@@ -30,8 +34,8 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
     """Return the files of a module and of its dependencies, by module name.
 
     Imports are followed wherever they stand, and so are strings that name a module (for a package, all its
-    modules). Code installed elsewhere than beside the module's own top-level package is left out: its version is
-    in run.json.
+    modules). Code installed elsewhere than beside the module's own top-level package is left out, and so are the
+    other packages in a folder of installed ones: their versions are in run.json.
 
     Args:
         module: Full name. Nothing is imported.
@@ -45,11 +49,12 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         return {}
     base = Path(spec.origin).parent.parent if spec.submodule_search_locations else Path(spec.origin).parent
+    is_installed = base.name in INSTALLED
     files_by_module: dict[str, Path] = {}
     queue = [module]
     while queue:
         name = queue.pop()
-        path = _file(base, name)
+        path = None if is_installed and name.partition(".")[0] != top else _file(base, name)
         skipped = any(name == excluded or name.startswith(f"{excluded}.") for excluded in excluded_modules)
         if skipped or name in files_by_module or path is None:
             continue
@@ -60,15 +65,15 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
             queue.append(parent)
         package = name if path.name == "__init__.py" else parent
         _, imports, module_strings = _scan(path)
-        for level, origin, names in imports:
+        for level, origin, imported_names in imports:
             target = (
                 origin if not level else ".".join([*package.split(".")[: len(package.split(".")) - level + 1], origin])
             )
             target = target.strip(".")
             queue += (
-                [target, *(f"{target}.{imported}" for imported in names)]
+                [target, *(f"{target}.{imported}" for imported in imported_names)]
                 if target != top
-                else [f"{top}.{imported_name}" for imported_name in names]
+                else [f"{top}.{imported_name}" for imported_name in imported_names]
             )
         for text in module_strings:
             queue.append(text)
@@ -79,6 +84,35 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
                 else []
             )
     return files_by_module
+
+
+def plugin_version(kind: str, table: Mapping[str, str], name: str) -> str:
+    """Return 12 hex digits over the source of an object that a package or the user brings, for the keys of results.
+
+    Args:
+        kind: As for `resolve`.
+        table: As for `resolve`.
+        name: A name that `resolve` understands; arguments and a label may follow.
+
+    Returns:
+        Hash over the module that the name stands for, the module of its class, and all that they import; "" for a
+        built-in name, whose source is that of SSAD.
+
+    Raises:
+        UnknownNameError, ConfigError: As for `resolve`.
+    """
+    name = Reference.parse(name).name
+    if name in table:
+        return ""
+    target, origin = resolve(kind, table, name), names(kind, table).get(name, name)
+    # An object is not always of a class of its own module: a scenario class is an instance of SSAD's ScenarioType.
+    modules = {origin.partition(":")[0], getattr(target, "__module__", None) or type(target).__module__}
+    return " ".join(filter(None, (source_version(module) for module in sorted(modules) if not _is_built_in(module))))
+
+
+def _is_built_in(module: str) -> bool:
+    """Return True for a module of SSAD or of Python, which decides no version of a plug-in."""
+    return module.partition(".")[0] in ("ssad", "builtins", "functools")
 
 
 def _file(base: Path, name: str) -> Path | None:

@@ -13,14 +13,14 @@ import jinja2
 import numpy as np
 
 from ssad.core.errors import ConfigError, SSADError
-from ssad.core.images import read_image, save_picture
+from ssad.core.images import save_picture
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import F64, U8
 from ssad.datasets.drawing import draw_edges
 from ssad.datasets.nuscenes.camera_truth import boxes_in_picture
-from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 
@@ -33,15 +33,16 @@ BOX, GROUND, EGO = (255, 170, 30), (15, 19, 26), (96, 165, 250)
 ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
 MIN_HEIGHT, MAX_HEIGHT = -0.5, 3.0  # m above the road: the ends of the colours of LiDAR points
 
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ name }}</title><style>
-:root{color-scheme:light dark}body{font:15px/1.5 system-ui,sans-serif;margin:0 auto;padding:0 16px 40px;max-width:1400px}
+STYLE = """:root{color-scheme:light dark}
+body{font:15px/1.5 system-ui,sans-serif;margin:0 auto;padding:0 16px 40px;max-width:1400px}
 h1{font-size:24px;overflow-wrap:anywhere}h2{font-size:18px;margin-top:36px}p,figcaption{color:GrayText}
 nav{display:flex;flex-wrap:wrap;gap:6px 14px}.grid{display:grid;grid-template-columns:repeat(3,1fr);gap:6px}
 figure{margin:0}img{width:100%;height:auto;display:block;border-radius:6px}.above{max-width:640px;margin-top:6px}
 @media(max-width:700px){.grid{grid-template-columns:1fr}}
-</style></head><body>
+"""
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ name }}</title><style>{{ style }}</style></head><body>
 <h1>{{ name }}</h1>
 <p>Version {{ version }}: {{ total }} scenes, of which {{ scenes|length }} are shown, {{ per }} moments of each at most.
 Boxes are those of the annotation table, the ten classes of the detection task in the pictures and everything from
@@ -95,6 +96,7 @@ def write_page(
         .from_string(PAGE)
         .render(
             name=data.root.name,
+            style=STYLE,
             version=data.version,
             total=len(data.scenes()),
             scenes=scene_entries,
@@ -148,7 +150,7 @@ def _write_camera_image(root: Path, frame: SensorFrame, annotations: Annotations
     """A picture with its boxes; one that cannot be read says why."""
     title = frame.channel
     try:
-        image = read_image(root / frame.filename)
+        image = read_frame_image(root, frame)
     except SSADError as error:
         image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
     scale = WIDTH / image.shape[1]
@@ -176,13 +178,7 @@ def draw_top_view(root: Path, lidar: SensorFrame, annotations: Annotations) -> U
         sensor_points = read_points(root / lidar.filename)[:, :3].astype(np.float64)
     except SSADError:
         sensor_points = np.zeros((0, 3))
-    points = sensor_points @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3]
-    points = points[(np.abs(points[:, :2]) < VIEW_RANGE).all(1)]
-    height_levels = np.clip((points[:, 2] - MIN_HEIGHT) / (MAX_HEIGHT - MIN_HEIGHT), 0, 1) * 255
-    if len(points):
-        pixels = np.clip(_to_pixels(points), 0, VIEW_SIZE - 1).astype(int)
-        colours = cv2.applyColorMap(height_levels.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
-        canvas[pixels[:, 1], pixels[:, 0]] = colours[:, 0, ::-1]
+    draw_points(canvas, sensor_points @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3])
     world_to_ego = np.linalg.inv(lidar.ego_to_world)
     if len(annotations):
         axes = world_to_ego[:3, :3] @ quaternion_to_matrix(annotations.rotation)
@@ -202,6 +198,22 @@ def draw_top_view(root: Path, lidar: SensorFrame, annotations: Annotations) -> U
             cv2.line(canvas, endpoints[0], endpoints[1], BOX, 1, cv2.LINE_AA, 4)
     cv2.drawMarker(canvas, (VIEW_SIZE // 2, VIEW_SIZE // 2), EGO, cv2.MARKER_TRIANGLE_UP, 14, 2)
     return canvas
+
+
+def draw_points(canvas: U8, points: F64, *, road_height: float = 0.0) -> None:
+    """Draw points from above, coloured by their height.
+
+    Args:
+        canvas: Picture [VIEW_SIZE, VIEW_SIZE, 3], RGB, which is changed; x points up and y to the left.
+        points: [P, 3], m.
+        road_height: z of the road, m.
+    """
+    points = points[(np.abs(points[:, :2]) < VIEW_RANGE).all(1)]
+    height_levels = np.clip((points[:, 2] - road_height - MIN_HEIGHT) / (MAX_HEIGHT - MIN_HEIGHT), 0, 1) * 255
+    if len(points):
+        pixels = np.clip(_to_pixels(points), 0, VIEW_SIZE - 1).astype(int)
+        colours = cv2.applyColorMap(height_levels.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+        canvas[pixels[:, 1], pixels[:, 0]] = colours[:, 0, ::-1]
 
 
 def _to_pixels(points: F64) -> F64:

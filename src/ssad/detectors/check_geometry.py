@@ -191,14 +191,14 @@ def _is_better_centre(documented: float, alternative: float) -> bool:
     return alternative > 0.5 and alternative > documented + 0.1
 
 
-def _mean_overlap(trial: CheckCase, batch_detections: list[Detections], reading: Convention) -> float:
+def _mean_overlap(trial: CheckCase, batch_detections: list[Detections], convention: Convention) -> float:
     """Return the mean overlap of the boxes with the hulls of the solids."""
     intrinsic = trial.intrinsics(1)
     image_overlaps = []
     for detections in batch_detections:
         if detections.solid is None or intrinsic is None:
             continue
-        solid = reading.apply(detections.solid)
+        solid = convention.apply(detections.solid)
         hulls = hull(project(solid_corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
         box, hulls = _clip(detections.box[:MAX_COMPARED], trial.size), _clip(hulls[:MAX_COMPARED], trial.size)
         is_visible = area(box) > 4
@@ -244,12 +244,12 @@ def _loss_of_convention(
     return loss
 
 
-def _detections_as_truth(detections: Detections, reading: Convention, trial: CheckCase) -> Truth:
+def _detections_as_truth(detections: Detections, convention: Convention, trial: CheckCase) -> Truth:
     """Return the best detections as truth."""
     intrinsic = trial.intrinsics(1)
     assert detections.solid is not None
     assert intrinsic is not None
-    solid = reading.apply(detections.solid)
+    solid = convention.apply(detections.solid)
     fields = (solid.centre, solid.size_lhw, solid.yaw, solid.velocity, solid.attribute)
     solids = Solids(*(field_values[:TRUTH_COUNT] for field_values in fields))
     return Truth(detections.label[:TRUTH_COUNT], _clip(detections.box[:TRUTH_COUNT], trial.size), solids, intrinsic[0])

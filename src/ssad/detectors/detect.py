@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from ssad.core.detections import Detections
-from ssad.core.errors import ConfigError, SSADError
+from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.frames import Camera
 from ssad.core.images import save_picture
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -36,11 +37,13 @@ class DrawnImage:
         path: Path of the drawn image.
         count: Number of boxes.
         notes: Assumptions, each in a few words.
+        problem: File and reason, where the image could not be read.
     """
 
     path: Path
     count: int
     notes: tuple[str, ...]
+    problem: str = ""
 
 
 def draw_detections(image: U8, detections: Detections, classes: Sequence[str], intrinsic: F64) -> U8:
@@ -88,16 +91,21 @@ def detect_images(
     files: Sequence[Path],
     out: Path,
     *,
+    root: Path | None = None,
     threshold: float = 0.3,
     focal: float | None = None,
     device: str = "cpu",
 ) -> list[DrawnImage]:
     """Draw the detections in images, and write all boxes to OUT/detections.json.
 
+    Images are upright by their EXIF orientation, and so are the boxes.
+
     Args:
         detector: Detector on the device.
         files: The images, of any size.
         out: Folder of the drawn images.
+        root: Folder of the images, whose layout OUT repeats; an unreadable file is then reported and the others go
+            on. None: images from anywhere.
         threshold: Minimum score.
         focal: Focal length in pixels, for a 3D detector; None: that of a typical camera, which is noted.
         device: Device of the detector.
@@ -106,19 +114,30 @@ def detect_images(
         One entry per image.
 
     Raises:
-        FormatError: A file is not an image.
+        FormatError: A file is not an image, and no root is given.
         ConfigError: Two images have the same name.
         StoreError: A file cannot be written.
     """
-    names = [file.stem for file in files]
+    keys = [file.name if root is None else file.relative_to(root).as_posix() for file in files]
     # Drawn images are named after the stem, so a.png and a.jpg would overwrite each other.
-    duplicate = next((name for name in names if names.count(name) > 1), None)
-    if duplicate is not None:
+    stems = [key.removesuffix(file.suffix) for key, file in zip(keys, files, strict=True)]
+    counts = Counter(stems)
+    duplicate = next((stem for stem, count in counts.items() if count > 1), None)
+    if duplicate is not None and root is None:
         raise ConfigError(f"two pictures are called {duplicate}; give them to two commands with two OUT folders")
-    make_folder(out)
+    # First, so that the folder of a stopped command is known as its own.
+    write_atomic(make_folder(out) / "detections.json", "{}\n")
     annotated_images, rows_by_file = [], {}
-    for file in files:
-        loaded = as_images(file)
+    for file, key, stem in zip(files, keys, stems, strict=True):
+        path = out / f"{stem if counts[stem] == 1 else key}.jpg"
+        try:
+            loaded = as_images(file)
+        except FormatError as error:
+            if root is None:
+                raise
+            problem = f"{key}: {str(error).removeprefix(f'{file}: ')}"
+            annotated_images.append(DrawnImage(path, 0, (), problem))
+            continue
         height, width = loaded.tensor.shape[-2:]
         camera = Camera.typical(width, height)
         intrinsic = camera.intrinsic.copy()
@@ -129,11 +148,10 @@ def detect_images(
         )
         (detections,) = Detections.cpu(detector.predict(loaded.tensor.to(device), intrinsic_batch, threshold=threshold))
         image = (loaded.tensor[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-        path = out / f"{file.stem}.jpg"
         if path.exists() and path.samefile(file):
             raise ConfigError(f"{path} would be written over the picture that is looked at; give another OUT")
         save_picture(path, draw_detections(image, detections, detector.classes, intrinsic))
-        rows_by_file[file.name] = _rows(detections, detector.classes)
+        rows_by_file[key] = _rows(detections, detector.classes)
         annotated_images.append(
             DrawnImage(
                 path, len(detections.score), (*loaded.notes, *(assumptions if intrinsic_batch is not None else ()))

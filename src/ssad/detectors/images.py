@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +13,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ssad.core.errors import ConfigError, FormatError
-from ssad.core.safeio import MIB, read_bytes
+from ssad.core.errors import ConfigError
+from ssad.core.image_files import ALPHA_NOTE, GREY_NOTE, read_image_file
 
-MAX_FILE = 256 * MIB
-MAX_PIXELS = 1 << 26
-FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 HINTS = {
     torch.int16: "; 16-bit pictures are uint16",
     torch.int32: "; convert to uint8 or uint16",
@@ -51,9 +46,9 @@ def as_images(x: Any, *, origin: str = "images") -> Images:
     channels and alpha is dropped, both with a note, since detectors expect colour. Any size is accepted.
 
     Args:
-        x: A file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright by its EXIF, or 16); a numpy array
-            [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of
-            these, all of one size.
+        x: A file name (see `ssad.core.image_files`; turned upright by its EXIF orientation); a numpy array [H, W],
+            [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of these, all
+            of one size.
         origin: Name of the argument, for messages.
 
     Raises:
@@ -106,65 +101,9 @@ def _from_tensor(x: Tensor, origin: str) -> Tensor:
 
 
 def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
-    """Read a file as [1, C, H, W], with notes on conversions; raise FormatError if it is not an image."""
-    from PIL import Image, ImageOps
-
-    content = read_bytes(path, limit=MAX_FILE)
-    try:
-        # Pillow warns of broken EXIF, which matters for the orientation only
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(content), formats=FORMATS) as image_file,
-        ):
-            if image_file.width * image_file.height > MAX_PIXELS:
-                raise FormatError(f"{path}: {image_file.width} x {image_file.height} pixels are more than {MAX_PIXELS}")
-            image_file.load()  # raises where the file is cut short
-            has_16_bits = _has_16_bits(image_file, content)
-            upright = ImageOps.exif_transpose(image_file)
-    except FormatError:
-        raise
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        reason = "cut short" if "truncated" in str(error) else f"not a picture of {', '.join(FORMATS)}"
-        raise FormatError(f"{path}: {reason}, or broken") from None
-    if has_16_bits:
-        return _read_16_bits(content, path)
-    if upright.mode == "P":
-        upright = upright.convert("RGBA" if "transparency" in upright.info else "RGB")
-    elif upright.mode in ("1", "CMYK", "YCbCr", "LAB", "HSV"):
-        upright = upright.convert("L" if upright.mode == "1" else "RGB")
-    if upright.mode not in ("L", "LA", "RGB", "RGBA"):
-        raise FormatError(f"{path}: pixels of mode {upright.mode}; pictures have 8 or 16 bits a channel")
-    return _channels(np.array(upright))
-
-
-def _has_16_bits(image_file: Any, content: bytes) -> bool:
-    """Return True for a file of 16 bits per channel, which Pillow keeps for greyscale only."""
-    if image_file.format == "PNG":
-        # Byte 24 of a PNG file is the bit depth in its IHDR chunk.
-        return content[24] == 16
-    # TIFF tag 258 is BitsPerSample.
-    return image_file.format == "TIFF" and bool(image_file.tag_v2.get(258, (8,))[0] == 16)
-
-
-def _read_16_bits(content: bytes, path: Path) -> tuple[Tensor, tuple[str, ...]]:
-    import cv2
-
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16:
-        raise FormatError(f"{path}: 16 bits a channel in a way that is not known")
-    # OpenCV returns BGR or BGRA.
-    channel_order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
-    return _channels(
-        pixels[..., channel_order[pixels.shape[2]]] if pixels.ndim == 3 and pixels.shape[2] in channel_order else pixels
-    )
-
-
-def _channels(pixels: npt.NDArray[Any]) -> tuple[Tensor, tuple[str, ...]]:
-    """Convert [H, W] or [H, W, C] to [1, 1 or 3, H, W], without alpha."""
-    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    notes = ("alpha left out",) if pixels.shape[2] in (2, 4) else ()
-    colour = np.ascontiguousarray(pixels[..., : 1 if pixels.shape[2] < 3 else 3])
-    return torch.from_numpy(colour).permute(2, 0, 1)[None], notes
+    """Read a file as [1, C, H, W], with notes on conversions."""
+    image_file = read_image_file(path)
+    return torch.from_numpy(image_file.pixels).permute(2, 0, 1)[None], image_file.notes
 
 
 def _to_floats(x: Tensor, notes: tuple[str, ...], *, origin: str) -> Images:
@@ -188,10 +127,10 @@ def _to_floats(x: Tensor, notes: tuple[str, ...], *, origin: str) -> Images:
         )
     if image.shape[1] == 4:
         image = image[:, :3]
-        notes = (*notes, "alpha left out")
+        notes = (*notes, ALPHA_NOTE)
     if image.shape[1] == 1:
         image = image.expand(-1, 3, -1, -1)
-        notes = (*notes, "greyscale repeated to three channels")
+        notes = (*notes, GREY_NOTE)
     return Images(image.contiguous(), notes)
 
 

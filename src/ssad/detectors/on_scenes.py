@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from ssad.core.detections import Detections, Truth, to_images
-from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
 from ssad.core.types import F64, U8
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.results import add_ego_distance
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
@@ -100,7 +100,7 @@ def detect_with(
         def read(frames: Sequence[SensorFrame]) -> Sequence[U8]:
             if load_images is not None:
                 return load_images(frames)
-            return list(pool.map(lambda frame: read_image(root / frame.filename), frames))
+            return list(pool.map(lambda frame: read_frame_image(root, frame), frames))
 
         with ThreadPoolExecutor(1) as producer:
             sample_blocks = [

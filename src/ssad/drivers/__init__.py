@@ -42,7 +42,7 @@ LARGEST = 8 << 30
 """Bytes of a file that an argument may name."""
 
 LEADERBOARD = "leaderboard"
-"""leaderboard:FILE.py is an agent of the CARLA leaderboard."""
+"""leaderboard:FILE.py is an agent of the CARLA leaderboard; ?share=true shares its networks among a batch."""
 
 
 def find_system(name: str) -> Any:
@@ -57,7 +57,8 @@ def find_system(name: str) -> Any:
     if base_name == LEADERBOARD and weights:
         from ssad.drivers.leaderboard import Leaderboard
 
-        return Leaderboard(weights)
+        check_arguments("system", full_name, Leaderboard, extra_arguments={"path": weights})
+        return Leaderboard(weights, **Reference.parse(full_name).options)
     resolved = resolve("system", SYSTEMS, name)
     check_arguments("system", full_name, resolved, is_instantiated=True)
     return resolved
@@ -83,7 +84,8 @@ def make_system(name: str) -> Driver:
     Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
     resolved, options = find_system(name), Reference.parse(name).options
-    system = resolved(**options) if isinstance(resolved, type) or options else resolved
+    is_agent = name.partition(":")[0] == LEADERBOARD  # found with its arguments
+    system = resolved(**options) if (isinstance(resolved, type) or options) and not is_agent else resolved
     controller = getattr(system, "controller", Controller.EXTERNAL)
     if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")

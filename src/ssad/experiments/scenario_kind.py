@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.folders import path_inside
 from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import to_plain_json
@@ -33,8 +34,8 @@ class ScenarioSuite(SuiteBase):
     """Keys of suites that drive scenarios.
 
     Attributes:
-        scenarios: Arguments of `load_scenarios` (sets, types, names, YAML files), or highway-env: that simulator's
-            intersection and highway.
+        scenarios: Arguments of `load_scenarios` (sets, classes, module:object, names, YAML files), or highway-env:
+            that simulator's intersection and highway.
         cluster: What is drawn independently of one another, for the intervals: towns' routes, each of which may have
             several scenarios, or scenarios.
     """
@@ -132,7 +133,7 @@ class ScenarioKind(Kind):
         """Drive the episode again and compare every bit of its trace."""
         start_warp_quietly()
         trace = self.drive_again(plan, cell, record)
-        recorded = load_trace(folder / record["artefacts"]["trace"])
+        recorded = load_trace(path_inside(folder, record["artefacts"]["trace"]))
         return Replay(cell, first_difference(recorded, trace), trace, cached_town(trace.town))
 
 

@@ -58,7 +58,7 @@ def write_lanes(
         lane_signs[lane].append((float(s), sign_ids[sign_index]))
     with_heights = float(np.ptp(graph.z)) > FLAT
     for lane in range(graph.lane_count):
-        _lanelet(
+        _write_lanelet(
             root,
             graph,
             lane,
@@ -68,11 +68,11 @@ def write_lanes(
             with_heights,
         )
     for index in range(len(graph.crosswalk_offset) - 1):
-        _crosswalk(root, graph, index, ids.next_id())
+        _write_crosswalk(root, graph, index, ids.next_id())
     for speed, sign_index in speed_sign_ids.items():
-        _sign(root, sign_index, xml.TOP_SPEED, graph.xy[0].tolist(), speed)
+        _write_sign(root, sign_index, xml.TOP_SPEED, graph.xy[0].tolist(), speed)
     for index, sign_index in sign_ids.items():
-        _sign(
+        _write_sign(
             root,
             sign_index,
             xml.STOP if graph.sign_kind[index] == SignKind.STOP else xml.YIELD,
@@ -80,8 +80,8 @@ def write_lanes(
         )
     programs = signal_programs(graph)
     for index, light_id in light_ids.items():
-        _light(root, light_id, graph.signal_xy[index], forced.get(index), programs[index].tolist(), dt)
-    _intersections(root, graph, ids)
+        _write_light(root, light_id, graph.signal_xy[index], forced.get(index), programs[index].tolist(), dt)
+    _write_intersections(root, graph, ids)
     hidden_count = len(graph.signal_phase) - len(signal_indices)
     omissions = [f"{hidden_count} places of signals that the map does not have"] if hidden_count else []
     return ids.next, omissions
@@ -104,7 +104,7 @@ def _bounds(graph: LaneGraph, lane: int, high: bool) -> list[F64]:
     return [np.column_stack([side, graph.z[points_slice]]) if high else side for side in sides]
 
 
-def _lanelet(  # noqa: PLR0917
+def _write_lanelet(  # noqa: PLR0917
     root: Element,
     graph: LaneGraph,
     lane: int,
@@ -146,7 +146,7 @@ def _lanelet(  # noqa: PLR0917
             add_element(element, tag, ref=reference)
 
 
-def _crosswalk(root: Element, graph: LaneGraph, k: int, number: int) -> None:
+def _write_crosswalk(root: Element, graph: LaneGraph, k: int, number: int) -> None:
     corners = graph.crosswalk(k)
     half = len(corners) // 2
     element = add_element(root, "lanelet", id=number)
@@ -157,7 +157,7 @@ def _crosswalk(root: Element, graph: LaneGraph, k: int, number: int) -> None:
     add_element(element, "userBidirectional", "pedestrian")
 
 
-def _sign(root: Element, number: int, kind: str, place: list[float], value: float | None = None) -> None:
+def _write_sign(root: Element, number: int, kind: str, place: list[float], value: float | None = None) -> None:
     sign = add_element(root, "trafficSign", id=number)
     sign_element = add_element(sign, "trafficSignElement")
     add_element(sign_element, "trafficSignID", kind)
@@ -167,7 +167,7 @@ def _sign(root: Element, number: int, kind: str, place: list[float], value: floa
     add_element(sign, "virtual", value is not None)
 
 
-def _light(  # noqa: PLR0917
+def _write_light(  # noqa: PLR0917
     root: Element, number: int, place: Any, state: SignalState | None, program: list[float], dt: float
 ) -> None:
     cycle, offset, green, yellow = (round(value / dt) for value in program)
@@ -188,7 +188,7 @@ def _light(  # noqa: PLR0917
     add_element(light, "active", True)
 
 
-def _intersections(root: Element, graph: LaneGraph, numbers: _IdCounter) -> None:
+def _write_intersections(root: Element, graph: LaneGraph, numbers: _IdCounter) -> None:
     for junction in sorted({int(lane_junction) for lane_junction in graph.junction} - {-1}):
         inner_lanes = np.flatnonzero((graph.junction == junction) & (graph.kind == LaneType.DRIVING)).tolist()
         lanes_by_entry: dict[int, list[int]] = defaultdict(list)

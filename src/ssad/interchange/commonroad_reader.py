@@ -23,7 +23,7 @@ from ssad.core.types import F64, EpisodeLimits, LaneType, Pose, Route, Scenario,
 from ssad.interchange.commonroad_lanelets import ImportedLanes, read_lanes
 from ssad.interchange.commonroad_obstacles import ObstacleReader
 from ssad.interchange.commonroad_writer import benchmark_map
-from ssad.interchange.commonroad_xml import STEP, VERSION, TextReader, own_values
+from ssad.interchange.commonroad_xml import STEP, VERSION, TextReader, parse_source
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
@@ -90,7 +90,7 @@ class _Reader:
     def __init__(self, location: str, root: Element) -> None:
         self.root, self.texts = root, TextReader(location)
         self.omissions: Counter[str] = Counter()
-        self.own_values = own_values(root.get("source", ""))
+        self.own_values = parse_source(root.get("source", ""))
         self.dt = self.texts.number(root.get("timeStepSize"), root, "timeStepSize")
         if not 0.0 < self.dt <= 10.0:
             raise self.texts.error(root, f"timeStepSize is {self.dt:g} s")

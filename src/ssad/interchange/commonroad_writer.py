@@ -17,7 +17,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Controller, Episode, EpisodeAgent, Pose
 from ssad.interchange.commonroad_lanes import write_lanes
-from ssad.interchange.commonroad_xml import TYPES, VERSION, add_element, decimal, own_source, points
+from ssad.interchange.commonroad_xml import TYPES, VERSION, add_element, decimal, format_source, points
 from ssad.world.models import model
 from ssad.world.roads import route_along
 
@@ -82,7 +82,7 @@ class _Writer:
                 "commonRoadVersion": VERSION,
                 "author": "SSAD",
                 "affiliation": "",
-                "source": own_source(metadata.items()),
+                "source": format_source(metadata.items()),
                 "date": DATE,
                 "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
             },
@@ -101,13 +101,13 @@ class _Writer:
         others = list(enumerate(episode.agents[1:], first_id))  # ids in the order of the agents
         for obstacle_id, agent in others:
             if self._is_static(agent):
-                self._static(root, obstacle_id, agent)
+                self._write_static(root, obstacle_id, agent)
         for obstacle_id, agent in others:
             if not self._is_static(agent):
-                self._dynamic(root, obstacle_id, agent)
+                self._write_dynamic(root, obstacle_id, agent)
         if len(episode.agents) > 1:
             self.omissions.append("names of actors: obstacles have numbers")
-        self._problem(root, first_id + len(others))
+        self._write_problem(root, first_id + len(others))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
         return text, tuple(self.omissions)
@@ -117,27 +117,27 @@ class _Writer:
         """Return whether an agent is a static obstacle: a parked vehicle or a prop."""
         return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
 
-    def _shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
+    def _write_shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
         body = model(agent.model)
         shape = add_element(add_element(obstacle, "shape"), "rectangle")
         add_element(shape, "length", body.length)
         add_element(shape, "width", body.width)
 
-    def _static(self, root: Element, number: int, agent: EpisodeAgent) -> None:
+    def _write_static(self, root: Element, number: int, agent: EpisodeAgent) -> None:
         obstacle = add_element(root, "staticObstacle", id=number)
         is_prop = model(agent.model).kind == AgentKind.PROP
         add_element(obstacle, "type", _STATIC.get(agent.model, "unknown") if is_prop else "parkedVehicle")
-        self._shape(obstacle, agent)
-        _state(add_element(obstacle, "initialState"), 0, agent.pose, 0.0)
+        self._write_shape(obstacle, agent)
+        _write_state(add_element(obstacle, "initialState"), 0, agent.pose, 0.0)
 
-    def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
+    def _write_dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
         first_step, rows = self._motion_rows(agent)
         if len(rows) < 2:
             self.omissions.append(f"{agent.name}, who is there for less than two steps")
             return
         obstacle = add_element(root, "dynamicObstacle", id=number)
         add_element(obstacle, "type", TYPES[model(agent.model).kind])
-        self._shape(obstacle, agent)
+        self._write_shape(obstacle, agent)
         velocity = np.diff(rows[:, :2], axis=0) / self.dt
         heading_vector = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], 1)
         speed = (np.concatenate([velocity, velocity[-1:]]) * heading_vector).sum(1)
@@ -146,10 +146,10 @@ class _Writer:
             for offset, (row, row_speed) in enumerate(zip(rows.tolist(), speed.tolist(), strict=True))
         ]
         # The format keeps the first state apart from the trajectory.
-        _state(add_element(obstacle, "initialState"), *states[0])
+        _write_state(add_element(obstacle, "initialState"), *states[0])
         trajectory = add_element(obstacle, "trajectory")
         for state in states[1:]:
-            _state(add_element(trajectory, "state"), *state)
+            _write_state(add_element(trajectory, "state"), *state)
 
     def _motion_rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
         """Return the first step, and x, y, yaw [T, 3] at each step at which an agent exists."""
@@ -164,7 +164,7 @@ class _Writer:
         columns[2] = np.asarray(wrap_angle(columns[2]))
         return first_step, np.stack(columns, 1)
 
-    def _problem(self, root: Element, number: int) -> None:
+    def _write_problem(self, root: Element, number: int) -> None:
         ego = self.episode.agents[0]
         assert ego.route is not None
         problem = add_element(root, "planningProblem", id=number)
@@ -175,14 +175,14 @@ class _Writer:
             add_element(add_element(start, tag), "exact", float(value))
         add_element(add_element(start, "time"), "exact", 0)
         goal = add_element(problem, "goalState")
-        _interval(add_element(goal, "time"), 0, self.steps)
+        _write_interval(add_element(goal, "time"), 0, self.steps)
         goal_pose = Pose(float(ego.route.xy[-1, 0]), float(ego.route.xy[-1, 1]), float(ego.route.yaw[-1]))
         circle = add_element(add_element(goal, "position"), "circle")
         add_element(circle, "radius", GOAL)
         centre = add_element(circle, "center")
         add_element(centre, "x", goal_pose.x)
         add_element(centre, "y", goal_pose.y)
-        _interval(add_element(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
+        _write_interval(add_element(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
         self._check_route(ego, goal_pose)
 
     def _check_route(self, ego: EpisodeAgent, end: Pose) -> None:
@@ -212,13 +212,13 @@ def _fitting_step(episode: Episode, dt: float) -> float:
     return next(candidates, steps[-1])
 
 
-def _state(element: Element, step: int, pose: Pose, speed: float) -> None:
+def _write_state(element: Element, step: int, pose: Pose, speed: float) -> None:
     points(add_element(element, "position"), [[pose.x, pose.y]])
     add_element(add_element(element, "orientation"), "exact", float(pose.yaw))
     add_element(add_element(element, "time"), "exact", step)
     add_element(add_element(element, "velocity"), "exact", float(speed))
 
 
-def _interval(element: Element, low: float, high: float) -> None:
+def _write_interval(element: Element, low: float, high: float) -> None:
     add_element(element, "intervalStart", low)
     add_element(element, "intervalEnd", high)

@@ -172,12 +172,12 @@ class TextReader:
         return low, high
 
 
-def own_values(source: str) -> dict[str, str]:
+def parse_source(source: str) -> dict[str, str]:
     """Return the fields of a `source` that SSAD wrote: `SSAD; name=...; ...`."""
     first, *fields = (field.strip() for field in source.split(";"))
     return dict(field.split("=", 1) for field in fields if "=" in field) if first == "SSAD" else {}
 
 
-def own_source(values: Iterable[tuple[str, Any]]) -> str:
-    """The `source` that `own_values` reads."""
+def format_source(values: Iterable[tuple[str, Any]]) -> str:
+    """The `source` that `parse_source` reads."""
     return "; ".join(["SSAD", *(f"{name}={str(value).replace(';', ',')}" for name, value in values)])

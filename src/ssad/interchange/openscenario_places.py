@@ -177,17 +177,15 @@ class PositionReader:
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:
-                # Lanes with a positive id run against s.
-                return LanePosition(
-                    section, min(max(s, 0.0), length) if lane < 0 else min(max(length - s, 0.0), length)
-                )
+                # Traffic of other lanes runs against s.
+                return LanePosition(section, min(max(s if self.graph.forward[section] else length - s, 0.0), length))
             s -= length
         raise AssertionError
 
     def _lane(self, element: Element) -> Pose:
         lane_id = int(self.values.number(element, "laneId"))
         place = self._on_lane(element, lane_id, self.values.number(element, "s"))
-        lateral_offset = self.values.number(element, "offset", 0.0) * (1.0 if lane_id < 0 else -1.0)
+        lateral_offset = self.values.number(element, "offset", 0.0) * (1.0 if self.graph.forward[place.lane] else -1.0)
         return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _road(self, element: Element) -> Pose:
@@ -201,7 +199,7 @@ class PositionReader:
         place = self._on_lane(element, nearest_id, self.values.number(element, "s"))
         width = self.graph.at(place.lane, place.s)[3]
         middle = math.copysign((abs(nearest_id) - 0.5) * width, nearest_id)
-        lateral_offset = (t - middle) * (1.0 if nearest_id < 0 else -1.0)
+        lateral_offset = (t - middle) * (1.0 if self.graph.forward[place.lane] else -1.0)
         return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _relative(self, element: Element) -> Pose:

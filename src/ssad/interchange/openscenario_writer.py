@@ -72,7 +72,7 @@ class _Writer:
         limits = episode.limits
         self.dt, self.until = dt, min(limits.max_steps * dt, limits.max_time)
         self.omissions: list[str] = []
-        self.names = _unique([agent.name for agent in episode.agents])
+        self.names = _unique_names([agent.name for agent in episode.agents])
 
     def write(self, network: str) -> tuple[str, tuple[str, ...]]:
         scenario = self.episode.scenario
@@ -100,18 +100,18 @@ class _Writer:
         _node(_node(root, "RoadNetwork"), "LogicFile", filepath=network)
         entities = _node(root, "Entities")
         for name, agent in zip(self.names, self.episode.agents, strict=True):
-            self._entity(entities, name, agent)
+            self._write_entity(entities, name, agent)
         storyboard = _node(root, "Storyboard")
-        self._init(_node(_node(storyboard, "Init"), "Actions"))
-        self._story(storyboard)
-        self._stop(_node(storyboard, "StopTrigger"))
+        self._write_init(_node(_node(storyboard, "Init"), "Actions"))
+        self._write_story(storyboard)
+        self._write_stop_condition(_node(storyboard, "StopTrigger"))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
         return text, tuple(self.omissions)
 
     # ------------------------------------------------------------ entities
 
-    def _entity(self, entities: Element, name: str, agent: EpisodeAgent) -> None:
+    def _write_entity(self, entities: Element, name: str, agent: EpisodeAgent) -> None:
         agent_model = model(agent.model)
         scenario_object = _node(entities, "ScenarioObject", name=name)
         blueprint = BLUEPRINTS.get(agent.model, agent.model)
@@ -138,7 +138,7 @@ class _Writer:
         _node(bounding_box, "Center", x=0.0, y=0.0, z=0.5 * agent_model.height)
         _node(bounding_box, "Dimensions", width=agent_model.width, length=agent_model.length, height=agent_model.height)
         if agent_model.kind not in _MASS:
-            _vehicle(body_element, agent_model)
+            _write_vehicle(body_element, agent_model)
         properties = _node(body_element, "Properties")
         _node(properties, "Property", name="type", value="simulation" if agent is not self._ego else "ego_vehicle")
         _node(properties, "Property", name="ssad.model", value=agent.model)
@@ -149,7 +149,7 @@ class _Writer:
 
     # ------------------------------------------------------------ the start
 
-    def _init(self, actions: Element) -> None:
+    def _write_init(self, actions: Element) -> None:
         mapped_signals = {
             signal_index: state
             for signal_index, state in sorted(self.episode.signal_override.items())
@@ -181,19 +181,19 @@ class _Writer:
                 continue  # an event adds it later
             agent_actions = _node(actions, "Private", entityRef=name)
             action = _node(agent_actions, "PrivateAction")
-            _position(_node(action, "TeleportAction"), agent.pose)
+            _write_position(_node(action, "TeleportAction"), agent.pose)
             if model(agent.model).kind == AgentKind.PROP:
                 continue
-            _speed(_node(agent_actions, "PrivateAction"), agent.speed, "step", "time", 0.0)
+            _write_speed(_node(agent_actions, "PrivateAction"), agent.speed, "step", "time", 0.0)
             policy = agent.policy or _POLICIES.get(agent.controller, "")
             if agent is self._ego or policy:
-                self._driver(agent_actions, agent, policy or "system under test")
+                self._write_controller(agent_actions, agent, policy or "system under test")
             if agent.wake_distance > 0.0:
                 self.omissions.append(
                     f"{name} waits until the ego is within {agent.wake_distance:g} m: it starts at once"
                 )
 
-    def _driver(self, private: Element, agent: EpisodeAgent, driver: str) -> None:
+    def _write_controller(self, private: Element, agent: EpisodeAgent, driver: str) -> None:
         controller_action = _node(_node(_node(private, "PrivateAction"), "ControllerAction"), "AssignControllerAction")
         properties = _node(_node(controller_action, "Controller", name=driver), "Properties")
         module = "external_control" if agent is self._ego else "npc_vehicle_control"
@@ -205,7 +205,7 @@ class _Writer:
         route_action = _node(_node(_node(private, "PrivateAction"), "RoutingAction"), "AssignRouteAction")
         route = _node(route_action, "Route", name=f"route of {driver}", closed=False)
         for pose in points:
-            _position(_node(route, "Waypoint", routeStrategy="shortest"), pose)
+            _write_position(_node(route, "Waypoint", routeStrategy="shortest"), pose)
 
     def _key_points(self, agent: EpisodeAgent) -> tuple[Pose, ...]:
         scenario = self.episode.scenario
@@ -222,7 +222,7 @@ class _Writer:
 
     # ------------------------------------------------------------ the storyboard
 
-    def _story(self, board: Element) -> None:
+    def _write_story(self, board: Element) -> None:
         act = None
         for name, agent in zip(self.names[1:], self.episode.agents[1:], strict=True):
             if not (agent.trajectory or (agent.controller == Controller.SCRIPT and agent.phases)):
@@ -234,15 +234,15 @@ class _Writer:
             _node(_node(group, "Actors", selectTriggeringEntities=False), "EntityRef", entityRef=name)
             maneuver = _node(group, "Maneuver", name=f"maneuver {name}")
             if agent.trajectory:
-                self._recorded(maneuver, name, agent)
+                self._trajectory_event(maneuver, name, agent)
             else:
-                self._scripted(maneuver, name, agent)
+                self._phase_events(maneuver, name, agent)
         if act is None:  # the format requires an act in a story
             return
         trigger = _node(act, "StartTrigger")
         _by_time(_node(trigger, "ConditionGroup"), "start of the act", 0.0)
 
-    def _recorded(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
+    def _trajectory_event(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
         rows = np.array(agent.trajectory)
         if rows[0, 0] < 0.0 < rows[-1, 0]:  # rows before the start have no effect
             first_future = int(np.searchsorted(rows[:, 0], 0.0, side="right"))
@@ -253,10 +253,10 @@ class _Writer:
             event = self._event(maneuver, f"{name} appears", "parallel")
             action = _node(_node(event, "Action", name=f"add {name}"), "GlobalAction")
             entity = _node(_node(action, "EntityAction", entityRef=name), "AddEntityAction")
-            _position(entity, Pose(*rows[0, 1:].tolist()))
+            _write_position(entity, Pose(*rows[0, 1:].tolist()))
             _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"{name} is due", begin_time)
         event = self._event(maneuver, f"{name} drives", "override")
-        follow_action = self._follow(event, name, [(row[0], Pose(*row[1:])) for row in rows.tolist()])
+        follow_action = self._follow_trajectory(event, name, [(row[0], Pose(*row[1:])) for row in rows.tolist()])
         timing = _node(follow_action, "TimeReference")
         _node(timing, "Timing", domainAbsoluteRelative="absolute", scale=1.0, offset=0.0)
         _node(follow_action, "TrajectoryFollowingMode", followingMode="position")
@@ -267,7 +267,7 @@ class _Writer:
             _node(_node(action, "EntityAction", entityRef=name), "DeleteEntityAction")
             _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"end of {name}", end_time)
 
-    def _scripted(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
+    def _phase_events(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
         event = self._event(maneuver, f"{name} keeps its path", "parallel")
         if agent.route is not None:
             rows = np.column_stack([agent.route.xy, agent.route.yaw]).astype(np.float64)
@@ -276,7 +276,7 @@ class _Writer:
             start = agent.pose
             end = Pose(start.x + FAR * math.cos(start.yaw), start.y + FAR * math.sin(start.yaw), start.yaw)
             points = [start, end]
-        follow_action = self._follow(event, name, [(None, pose) for pose in points])
+        follow_action = self._follow_trajectory(event, name, [(None, pose) for pose in points])
         _node(_node(follow_action, "TimeReference"), "None")
         _node(follow_action, "TrajectoryFollowingMode", followingMode="position")
         _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"path of {name}", 0.0)
@@ -286,10 +286,10 @@ class _Writer:
             event = self._event(maneuver, f"{name} phase {phase_index}", "override")
             action = _node(_node(event, "Action", name=f"{name} speed {phase_index}"), "PrivateAction")
             if agent_model.kind == AgentKind.WALKER:
-                _speed(action, phase.speed, "step", "time", 0.0)
+                _write_speed(action, phase.speed, "step", "time", 0.0)
             else:
                 acceleration = agent_model.max_accel if phase.speed >= speed else agent_model.max_brake
-                _speed(action, phase.speed, "linear", "rate", acceleration)
+                _write_speed(action, phase.speed, "linear", "rate", acceleration)
             trigger = _node(event, "StartTrigger")
             # phases are latched, one after another: an event waits until the previous one runs or is complete
             for state in ("runningState", "completeState") if previous_event else ("",):
@@ -316,7 +316,7 @@ class _Writer:
     def _event(self, maneuver: Element, name: str, priority: str) -> Element:
         return _node(maneuver, "Event", name=name, priority=priority, maximumExecutionCount=1)
 
-    def _follow(self, event: Element, name: str, vertices: list[tuple[float | None, Pose]]) -> Element:
+    def _follow_trajectory(self, event: Element, name: str, vertices: list[tuple[float | None, Pose]]) -> Element:
         action = _node(_node(event, "Action", name=f"path of {name}"), "PrivateAction")
         follow_action = _node(_node(action, "RoutingAction"), "FollowTrajectoryAction")
         trajectory = _node(
@@ -325,7 +325,7 @@ class _Writer:
         polyline = _node(_node(trajectory, "Shape"), "Polyline")
         for time, pose in vertices:
             vertex = _node(polyline, "Vertex", **({} if time is None else {"time": time}))
-            _position(vertex, pose)
+            _write_position(vertex, pose)
         return follow_action
 
     def _condition(self, group: Element, label: str, name: str, condition: PhaseTrigger) -> None:
@@ -351,7 +351,7 @@ class _Writer:
                 coordinateSystem="entity",
             )
 
-    def _stop(self, trigger: Element) -> None:
+    def _write_stop_condition(self, trigger: Element) -> None:
         limits: EpisodeLimits = self.episode.limits
         _by_time(_node(trigger, "ConditionGroup"), "max_steps", limits.max_steps * self.dt)
         if math.isfinite(limits.max_time):
@@ -369,10 +369,12 @@ class _Writer:
                 "who touches the ego is taken away: there is no such action, contacts are only counted"
             )
         entity_condition = _by_entity(_node(trigger, "ConditionGroup"), "end of the route", ego)
-        _position(_node(entity_condition, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1])
+        _write_position(
+            _node(entity_condition, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1]
+        )
 
 
-def _unique(names: list[str]) -> list[str]:
+def _unique_names(names: list[str]) -> list[str]:
     """Return the names, with a number behind repeated ones."""
     unique: list[str] = []
     for name in names:
@@ -385,7 +387,7 @@ def _unique(names: list[str]) -> list[str]:
     return unique
 
 
-def _vehicle(item: Element, body: Model) -> None:
+def _write_vehicle(item: Element, body: Model) -> None:
     _node(
         item,
         "Performance",
@@ -406,11 +408,11 @@ def _vehicle(item: Element, body: Model) -> None:
         )
 
 
-def _position(parent: Element, pose: Pose) -> None:
+def _write_position(parent: Element, pose: Pose) -> None:
     _node(_node(parent, "Position"), "WorldPosition", x=float(pose.x), y=float(pose.y), z=0.0, h=float(pose.yaw))
 
 
-def _speed(action: Element, speed: float, shape: str, dimension: str, value: float) -> None:
+def _write_speed(action: Element, speed: float, shape: str, dimension: str, value: float) -> None:
     speed_action = _node(_node(action, "LongitudinalAction"), "SpeedAction")
     _node(speed_action, "SpeedActionDynamics", dynamicsShape=shape, dynamicsDimension=dimension, value=float(value))
     _node(_node(speed_action, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=float(speed))

@@ -201,13 +201,13 @@ def _record_scenes(task: tuple[Recording, str, Sequence[int]]) -> None:
         _record_scene(recording, town, number)
 
 
-def _name(town: str, number: int) -> str:
+def _scene_name(town: str, number: int) -> str:
     return f"scene-{town.lower()}-{number:03d}"
 
 
 def _record_scene(recording: Recording, town: str, number: int) -> None:
     """Record one scene into its part; a finished part is left alone."""
-    name = _name(town, number)
+    name = _scene_name(town, number)
     parts = recording.parts
     if parts.is_finished(name):
         return
@@ -503,7 +503,7 @@ def record_nuscenes(
     pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
     with recording.parts.lock("ssad record"):
         run_all(pool, _record_scenes, tasks, timeout_s=TIME_LIMIT, progress=progress)
-        _merge(recording, [_name(town, number) for _, town, numbers in tasks for number in numbers])
+        _merge(recording, [_scene_name(town, number) for _, town, numbers in tasks for number in numbers])
     return out
 
 

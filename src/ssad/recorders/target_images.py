@@ -111,14 +111,14 @@ def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> 
     population = place_objects(trace, graph, street, key=key, many_signs=recording.streets == "any")
     places: tuple[Place, ...] = ()
     if isinstance(recording.target, TargetSign):
-        targets: tuple[ObjectBody, ...] = (_sign(population, recording.target),)
+        targets: tuple[ObjectBody, ...] = (_add_target_sign(population, recording.target),)
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
         free_ground = GroundOccupancy(street)
         occupy_standing(population, free_ground)
         free_spots = free_places(graph, route_points, free_ground, key=("target", *key))
         places = tuple((*place, plate_height(targets[0])) for place in free_spots)
     elif recording.target is not None:
-        targets = (_body_of_target(population, recording.target),)
+        targets = (_add_target_body(population, recording.target),)
     else:
         target_count = TARGETS if recording.mode == "orbit" else 1
         targets = tuple(
@@ -145,13 +145,13 @@ def _draw_target(population: SceneObjects, rng: np.random.Generator) -> ObjectBo
     return _body(mesh, style, size, draw_paint(rng))
 
 
-def _body_of_target(population: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
+def _add_target_body(population: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
     """The target in the place of the ego, with its mesh in the cast."""
     body = _body(population.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
     return replace(body, kind=class_of_target(target))
 
 
-def _sign(population: SceneObjects, target: TargetSign) -> ObjectBody:
+def _add_target_sign(population: SceneObjects, target: TargetSign) -> ObjectBody:
     """The target sign: its plate, which is labelled, and its post."""
     meshes = tuple(population.meshes.add(mesh) for mesh in plate_and_post(target.mesh()))
     size, static_track = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
@@ -219,7 +219,7 @@ def _viewpoint_rounds(
         yield sorted(first_free.items())
 
 
-def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
+def _record_part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     """Record `count` images, of one drive if possible, and return the name of the part.
 
     A finished part is left alone.
@@ -452,7 +452,7 @@ def record_all(
             locks.enter_context(recording.parts.lock("ssad record"))
             safeio.remove_unfinished(recording.out / "images")
         pool = open_pool(len(all_tasks), workers=workers, ray=ray, device=recordings[0].device)
-        run_all(pool, _part, all_tasks, timeout_s=TIME_LIMIT, progress=progress)
+        run_all(pool, _record_part, all_tasks, timeout_s=TIME_LIMIT, progress=progress)
         for recording, recording_tasks in zip(recordings, tasks, strict=True):
             _write_pages(recording, recording_tasks)
     return [recording.out for recording in recordings]

@@ -258,7 +258,7 @@ class MetricChange:
     tip: str
 
 
-SIZE, MARGIN = 360, 46
+SIZE, MARGIN, TOP = 360, 46, 24  # pixels; TOP has room for the name of a point at the upper end
 NAME_ROOM = (110.0, 13.0)  # pixels of a name
 
 
@@ -285,16 +285,16 @@ def change_plot(
         return MARGIN + SIZE * (min(max(value, left), right) - left) / (right - left)
 
     def y(value: float) -> float:
-        return 10 + SIZE * (top - min(max(value, bottom), top)) / (top - bottom)
+        return TOP + SIZE * (top - min(max(value, bottom), top)) / (top - bottom)
 
     def emphasis(tick: float) -> str | None:
         return "stroke-width:2" if tick == 0.0 else None
 
     elements = []
     for tick in _ticks(left, right):
-        segment_ends = {"x1": x(tick), "x2": x(tick), "y1": 10, "y2": SIZE + 10}
+        segment_ends = {"x1": x(tick), "x2": x(tick), "y1": TOP, "y2": SIZE + TOP}
         elements.append(element("line", **segment_ends, class_="grid", style=emphasis(tick)))
-        elements.append(label_text(x(tick), SIZE + 26, f"{tick:g}", anchor="middle"))
+        elements.append(label_text(x(tick), SIZE + TOP + 16, f"{tick:g}", anchor="middle"))
     for tick in _ticks(bottom, top):
         segment_ends = {"x1": MARGIN, "x2": MARGIN + SIZE, "y1": y(tick), "y2": y(tick)}
         elements.append(element("line", **segment_ends, class_="grid", style=emphasis(tick)))
@@ -319,10 +319,10 @@ def change_plot(
         legend_y = 22 + 16 * number
         elements.append(dot(MARGIN + SIZE + 64, legend_y, 5, colours.get(group, series_colour(3))))
         elements.append(label_text(MARGIN + SIZE + 74, legend_y + 4, group))
-    elements.append(label_text(MARGIN + SIZE / 2, SIZE + 44, x_title, anchor="middle"))
-    rotation = f"rotate(-90 12 {SIZE / 2})"
-    elements.append(element("text", escape(y_title), x=12, y=SIZE / 2, transform=rotation, text_anchor="middle"))
-    return figure(elements, label, viewBox=f"0 0 {SIZE + MARGIN + 140} {SIZE + 52}")
+    elements.append(label_text(MARGIN + SIZE / 2, SIZE + TOP + 34, x_title, anchor="middle"))
+    rotation = f"rotate(-90 12 {TOP + SIZE / 2})"
+    elements.append(element("text", escape(y_title), x=12, y=TOP + SIZE / 2, transform=rotation, text_anchor="middle"))
+    return figure(elements, label, viewBox=f"0 0 {SIZE + MARGIN + 140} {SIZE + TOP + 42}")
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:

@@ -52,12 +52,12 @@ def event_sentence(subject: str, verb: str, lines: Sequence[Line], metric: str, 
         The sentence without a full stop.
     """
     cell = metric_cell(lines, metric, "share")
-    ran = [line for line in lines if line["status"] == "ok"]
-    if not ran:
+    completed_lines = [line for line in lines if line["status"] == "ok"]
+    if not completed_lines:
         return f"{subject} has no {rate}: all of its {len(lines)} {noun} failed"
-    events = sum(metric_of(line, metric) == 1.0 for line in ran)
-    sentence = f"{subject} {verb} {events} of {len(ran)} {noun}"
-    if failed := len(lines) - len(ran):
+    events = sum(metric_of(line, metric) == 1.0 for line in completed_lines)
+    sentence = f"{subject} {verb} {events} of {len(completed_lines)} {noun}"
+    if failed := len(lines) - len(completed_lines):
         sentence += f"; {failed} more failed, so its {rate} lies in {cell.interval} whatever they were"
     return sentence
 

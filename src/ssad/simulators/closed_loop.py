@@ -16,8 +16,8 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
-from ssad.core.registry import Reference
-from ssad.core.source import source_version
+from ssad.core.registry import Reference, check_arguments, make, resolve
+from ssad.core.source import plugin_version, source_version
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 if TYPE_CHECKING:
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 STEP = 0.1  # s
 WIDTH = 640  # pixels of a picture of nuScenes' rig
 HIGHWAY = "highway-env"  # as a set of scenarios
+EMBEDDED = "embedded"
+SIMULATORS: dict[str, str] = {EMBEDDED: "ssad.world.world:World"}
+"""Simulator -> "module:object", called with episodes, lane graphs and a keyword `device`; carla://HOST:PORT apart."""
+MEMBERS = ("dt", "batch", "agents", "episodes", "assigned", "graphs", "reset", "step", "state", "ended", "take")
 HIGHWAY_TYPE = "ssad.simulators.highway_env:SCENARIO"
 
 
@@ -49,6 +53,45 @@ class EpisodeRequest(Protocol):
     @property
     def spec(self) -> Mapping[str, Any]:
         """Scenario (see `scenario_json`), repetition (0: nominal), spread, and any external simulator."""
+
+
+def is_carla(simulator: str | None) -> bool:
+    """Return True for the address of a CARLA server."""
+    return simulator is not None and simulator.partition(":")[0] == "carla"
+
+
+def simulator_version(name: str) -> str:
+    """Return 12 hex digits over the source of a simulator of the user's own; "" for SSAD's own world.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+        ConfigError: It takes no such arguments.
+    """
+    target = resolve("simulator", SIMULATORS, Reference.parse(name).name)
+    check_arguments("simulator", name, target, extra_arguments={"episodes": (), "graphs": {}, "device": "cpu"})
+    return plugin_version("simulator", SIMULATORS, name)
+
+
+def make_simulator(
+    name: str, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], *, device: str
+) -> Simulator:
+    """Return a simulator that runs some episodes side by side.
+
+    Args:
+        name: Key of `SIMULATORS`, entry point of the group `ssad.simulators`, or "module:object"; arguments may follow.
+        episodes: The episodes.
+        graphs: Lane graph of each of their towns.
+        device: cpu or cuda.
+
+    Raises:
+        UnknownNameError: There is no such simulator.
+        ConfigError: It cannot be made, or lacks an attribute or a method of `ssad.core.driving.Simulator`.
+    """
+    reference = Reference.parse(name)
+    target = resolve("simulator", SIMULATORS, reference.name)
+    options = {"episodes": episodes, "graphs": graphs, "device": device, **reference.options}
+    simulator: Simulator = make("simulator", reference.name, target, options, MEMBERS)
+    return simulator
 
 
 def load_kernels(device: str) -> None:
@@ -109,12 +152,14 @@ def policies_of(scenario: Scenario) -> list[str]:
 
 
 def type_version(name: str) -> str:
-    """Return 12 hex digits over the source of a user's scenario type ("module:object"); "" for a built-in one.
+    """Return 12 hex digits over the source of a user's scenario type; "" for a built-in one.
 
     The type that highway-env runs has the version of highway-env appended.
     """
-    source_hash = source_version(name.partition(":")[0]) if ":" in name else ""
-    return f"{source_hash} {version('highway-env')}" if name == HIGHWAY_TYPE else source_hash
+    from ssad.scenarios.dynamic.catalogue import TYPES
+
+    source_hash = plugin_version("scenario", TYPES, name)
+    return f"{source_hash} {version('highway-env')}".strip() if name == HIGHWAY_TYPE else source_hash
 
 
 def runs_in_highway_env(request: EpisodeRequest) -> bool:
@@ -189,7 +234,6 @@ def drive(
     from ssad.drivers import make_system
     from ssad.simulators.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
-    from ssad.world.world import World
 
     # Runs that are to be compared can share the noise of their sensors through this key.
     episodes = [replace(build_requested_episode(request), key=key(request)) for request in requests]
@@ -199,14 +243,14 @@ def drive(
     for agent_driver in (system, *policies.values()):
         if callable(getattr(agent_driver, "to", None)):
             agent_driver.to(device)  # type: ignore[attr-defined]
-    server_spec = requests[0].spec.get("simulator")
+    simulator_name = requests[0].spec.get("simulator", EMBEDDED)
     simulator: Simulator
-    if server_spec:
+    if is_carla(simulator_name):
         from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
         from ssad.simulators.carla.server import Server
         from ssad.simulators.carla.simulator import Carla
 
-        server = Server.of(server_spec)
+        server = Server.of(simulator_name)
         carla_cameras = (
             sensor_blueprints(requested_sensors([system]), STEP)
             if server.sensors == "carla" and sensors is None
@@ -217,15 +261,15 @@ def drive(
             sensors = onboard_sensors(list(policies.values()), device) | {
                 name: CarlaSensor(name) for name in carla_cameras
             }
+    elif runs_in_highway_env(requests[0]):
+        simulator = HighwayEnv(episodes, graphs)
     else:
-        simulator = (
-            HighwayEnv(episodes, graphs) if runs_in_highway_env(requests[0]) else World(episodes, graphs, device=device)
-        )
+        simulator = make_simulator(simulator_name, episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
-        simulator_metrics = dict(getattr(simulator, "measured", {}))
+        simulator_metrics = dict(getattr(simulator, "measured", {})) if is_carla(simulator_name) else {}
     finally:
         # External simulators hold a connection, which must end even if a driver raises.
         getattr(simulator, "close", lambda: None)()

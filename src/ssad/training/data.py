@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from ssad.core.images import read_image
 from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.training.batches import TrainingImage
 
@@ -31,4 +31,4 @@ def nuscenes_items(root: Path, version: str | None, split: str, *, limit: int | 
             for frame in scene.frames:
                 if frame.modality == "camera" and frame.key_frame:
                     truth = camera_truth(frame, scene.annotations(frame.sample_token))
-                    yield TrainingImage(partial(read_image, root / frame.filename), truth)
+                    yield TrainingImage(partial(read_frame_image, root, frame), truth)

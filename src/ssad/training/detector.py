@@ -22,7 +22,7 @@ from ssad.core import errors, safeio
 from ssad.core.checkpoints import WeightsCard, copy_matching_weights, hash_state, load_weights, save_weights
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
-from ssad.core.images import read_image
+from ssad.core.images import read_annotated_image
 from ssad.core.seeding import digest
 from ssad.datasets.coco import CocoSet, read_coco
 from ssad.datasets.nuscenes.camera_truth import scenes_of
@@ -114,7 +114,8 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Training
     data = read_coco(path)
     truths = coco_truth(data)
     return data.classes, [
-        TrainingImage(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
+        TrainingImage(partial(read_annotated_image, image.file, width=image.width, height=image.height), truth)
+        for image, truth in zip(data.images, truths, strict=True)
     ]
 
 

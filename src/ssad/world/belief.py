@@ -12,10 +12,9 @@ import numpy.typing as npt
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import TURN, LaneGraph
 from ssad.core.rotations import wrap_angle, wrap_scalar
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
-from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, TurnRank
 from ssad.world.kernels.shared import BRIDGE
@@ -227,7 +226,7 @@ class Lanes:
         turn_rank = np.where(
             np.abs(heading_change) < TURN,
             TurnRank.STRAIGHT,
-            np.where(heading_change > 0, TurnRank.LEFT, TurnRank.RIGHT),
+            np.where((heading_change > 0) ^ bool(graph.left_hand[0]), TurnRank.LEFT, TurnRank.RIGHT),
         )
         distance, rank_ahead = np.where(in_junction, 0.0, FAR), np.where(in_junction, turn_rank, 0).astype(np.float64)
         successor = np.maximum(self._next, 0)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
 from ssad.core.driving import Policies
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import ENDS, Controller, End, Episode
 from ssad.world.actions import ACTIONS, WIDTHS, to_controls
@@ -54,6 +54,28 @@ def action_space(kind: Action) -> gym.spaces.Box:
     if kind not in get_args(Action):
         raise ConfigError(f"unknown action '{kind}'; known: {', '.join(get_args(Action))}")
     return gym.spaces.Box(-1.0, 1.0, (ACTIONS[kind],), np.float32)
+
+
+def _check_options(options: Mapping[str, Any] | None, allowed: Sequence[str]) -> Mapping[str, Any]:
+    """Return the options of a reset. ConfigError for keys that it does not know, or that exclude each other."""
+    for key in options or {}:
+        if key not in allowed:
+            raise ConfigError(f"unknown option '{key}' of reset; known: {', '.join(allowed)}")
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    if len(given) > 1:
+        raise ConfigError(f"reset takes one of the options {' and '.join(given)}: both choose what is driven")
+    return given
+
+
+def _draw_episode(episodes: Sequence[Episode], scenario: str | None, random: np.random.Generator) -> int:
+    """Return the number of a random episode of a scenario or a group of scenarios; None: of the whole bank."""
+    if scenario is None:
+        return int(random.integers(len(episodes)))
+    candidates = [index for index, episode in enumerate(episodes) if episode.scenario.name == scenario]
+    candidates = candidates or [index for index, episode in enumerate(episodes) if episode.scenario.group == scenario]
+    if not candidates:
+        raise unknown_name("scenario", str(scenario), {item.scenario.name for item in episodes})
+    return candidates[int(random.integers(len(candidates)))]
 
 
 class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
@@ -138,14 +160,42 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def _draw(self, count: int) -> npt.NDArray[np.int32]:
         return self.np_random.integers(len(self.world.episodes), size=count).astype(np.int32)
 
+    def _choose_episodes(self, options: Mapping[str, Any]) -> npt.NDArray[np.int32]:
+        """Return the episode of each scene, as the options of `reset` ask."""
+        if not options:
+            return self._draw(self.num_envs)
+        key, value = next(iter(options.items()))
+        values = [value] * self.num_envs if isinstance(value, str) else value
+        if np.shape(values) != (self.num_envs,):
+            raise ConfigError(
+                f"option '{key}' of reset needs one for each of {self.num_envs} scenes, not {value!r:.60}"
+            )
+        if key == "episodes":
+            return np.asarray(values, np.int32)
+        return np.array([_draw_episode(self.world.episodes, name, self.np_random) for name in values], np.int32)
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start all scenes; `options={"episodes": [...]}` gives the episode of the bank that each one runs."""
+        """Start all scenes, each with an episode drawn from the bank.
+
+        Args:
+            seed: Seed of this and all later draws; of a list the first.
+            options: `{"scenario": NAME}` draws from the episodes of that scenario or group of scenarios;
+                `{"scenario": [NAME, ...]}` names one for each scene, None: any. `{"episodes": [...]}` gives the number
+                of the episode in the bank for each scene.
+
+        Returns:
+            Observations [num_envs, n], and the numbers of the episodes as `info["episode"]`.
+
+        Raises:
+            ConfigError: An option is unknown or does not fit the number of scenes.
+            UnknownNameError: The bank has no such scenario.
+        """
+        chosen = _check_options(options, ("scenario", "episodes"))
         scalar_seed = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=scalar_seed)
-        requested = (options or {}).get("episodes")
-        assignment = self._draw(self.num_envs) if requested is None else np.asarray(requested, np.int32)
+        assignment = self._choose_episodes(chosen)
         self._loop.reset(episodes=assignment)
         return self._observe(), {"episode": assignment.copy()}
 
@@ -215,10 +265,27 @@ class SingleEnv(gym.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; `options={"episode": k}` selects it."""
+        """Start an episode.
+
+        Args:
+            seed: Seed of this and all later draws.
+            options: `{"scenario": NAME}` draws from the episodes of that scenario or group of scenarios;
+                `{"episode": k}` takes number k of the bank.
+
+        Returns:
+            Observation [n], and the number of the episode as `info["episode"]`.
+
+        Raises:
+            ConfigError: An option is unknown, or the bank has no such episode.
+            UnknownNameError: The bank has no such scenario.
+        """
+        chosen = _check_options(options, ("scenario", "episode"))
         super().reset(seed=seed)
-        requested = (options or {}).get("episode")
-        episode_index = int(self.np_random.integers(len(self.world.episodes))) if requested is None else int(requested)
+        episode_index = (
+            int(chosen["episode"])
+            if "episode" in chosen
+            else _draw_episode(self.world.episodes, chosen.get("scenario"), self.np_random)
+        )
         observation, _ = self._many.reset(options={"episodes": [episode_index]})
         self._show()
         return observation[0], {"episode": episode_index}

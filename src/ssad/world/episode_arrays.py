@@ -11,7 +11,7 @@ import warp as wp
 
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.lane_graph import LaneGraph, Marking, SignKind
+from ssad.core.lane_graph import TURN, LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, PhaseCondition, Roads, TurnRank, array_types
 from ssad.world.kernels.shared import BRIDGE
@@ -25,7 +25,6 @@ BEFORE = 15  # points of a route before a junction between which its stop line l
 GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
 ON_AND_ON = 1000.0  # m that a lane goes on beyond the end of a route
 FADE = 30  # m over which a lane that ends is led back to the route
-TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 
 
 @dataclass(frozen=True)
@@ -154,6 +153,7 @@ def _junctions(
     inside = np.zeros(count, bool)
     on_lane = route.lane >= 0
     inside[on_lane] = graph.junction[route.lane[on_lane]] >= 0
+    near_side = 1.0 if graph.left_hand[0] else -1.0
     entry_distance, exit_distance = np.full(count, FAR), np.full(count, FAR)
     turn_rank = np.zeros(count)
     edges = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
@@ -164,7 +164,7 @@ def _junctions(
         turn_kind = (
             int(TurnRank.STRAIGHT)
             if abs(heading_change) < TURN
-            else (TurnRank.LEFT if heading_change > 0 else TurnRank.RIGHT)
+            else (TurnRank.RIGHT if heading_change * near_side > 0 else TurnRank.LEFT)
         )
         if first_inside > 0 and int(route.lane[first_inside - 1]) in signed_lanes:
             turn_kind += TurnRank.YIELD
@@ -473,7 +473,7 @@ def _tables(graphs: Sequence[LaneGraph], pool: _Pool) -> RoadTables:
         lane=np.concatenate([shifted(table.lane, table.town) for table in pool.tables]),
         left=np.concatenate([shifted(graph.left, graph.name) for graph in graphs]),
         right=np.concatenate([shifted(graph.right, graph.name) for graph in graphs]),
-        side=np.concatenate([np.sign(graph.lane_id).astype(np.int32) for graph in graphs]),
+        side=np.concatenate([np.where(graph.forward, -1, 1).astype(np.int32) for graph in graphs]),
         junction=np.concatenate([graph.junction >= 0 for graph in graphs]),
     )
 
@@ -489,7 +489,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
         parts["lane_junction"].append((graph.junction >= 0).astype(np.int32))
         parts["cell_first"].append(grid.cell_offset + entries)
         parts["cell_segment"].append(grid.cell_seg + segments)
-        parts["grid"].append(np.array([[*grid.origin, 1.0 / CELL, 0.0]]))
+        parts["grid"].append(np.array([[*grid.origin, 1.0 / CELL, float(graph.turn_on_red[0])]]))
         parts["grid_size"].append(np.array([[grid.nx, grid.ny, cells]]))
         parts["signal_first"].append(np.array([signals]))
         parts["signal_program"].append(signal_programs(graph))

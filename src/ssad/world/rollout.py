@@ -75,7 +75,7 @@ class Loop:
                 raise ConfigError(
                     f"an actor follows the policy '{name}': say who makes drivers, policies=ssad.make_system"
                 )
-            self.drivers.append((_policy_selector(simulator, name, len(self.drivers)), policies(name)))
+            self.drivers.append((_PolicySelector(simulator, name, len(self.drivers)), policies(name)))
         self.sensors = SENSORS | dict(sensors or {})
         self._image_change = None if isinstance(perturbation, LoopChanges | Mapping | None) else perturbation
         if isinstance(perturbation, LoopChanges):
@@ -123,19 +123,21 @@ class Loop:
         """
         simulator = self.simulator
         simulator.reset(scenes, episodes=episodes)
-        started = np.full(simulator.batch, scenes is None)
+        is_started = np.full(simulator.batch, scenes is None)
         if scenes is not None:
-            started[np.asarray(scenes)] = True
+            is_started[np.asarray(scenes)] = True
         for policy, (target, driver) in enumerate(self.drivers):
             if isinstance(target, int):
-                self._seat(policy, (np.arange(simulator.agents) == target) & started[:, None])
+                self._assign_policy(policy, (np.arange(simulator.agents) == target) & is_started[:, None])
             if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
-                assigned = [simulator.episodes[episode_index] for episode_index in simulator.assigned]
+                episodes_by_scene = [simulator.episodes[episode_index] for episode_index in simulator.assigned]
                 if seeds is not None:
-                    assigned = [replace(episode, seed=seed) for episode, seed in zip(assigned, seeds, strict=True)]
-                driver.reset(assigned)
+                    episodes_by_scene = [
+                        replace(episode, seed=seed) for episode, seed in zip(episodes_by_scene, seeds, strict=True)
+                    ]
+                driver.reset(episodes_by_scene)
 
-    def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
+    def _assign_policy(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
         driver = self.drivers[policy][1]
         speed = getattr(driver, "target_speed", None)
         self.simulator.take(mask, driver.controller, policy=policy, target_speed=speed)
@@ -176,7 +178,7 @@ class Loop:
                     if (current & ~selected).any():
                         self.simulator.take(current & ~selected, None)
                     if (selected & ~current).any():
-                        self._seat(policy, selected & ~current)
+                        self._assign_policy(policy, selected & ~current)
                     state = self.simulator.state()
                 agents = np.argwhere(selected).astype(np.int32)
             if external and agents is not None and len(agents):
@@ -324,17 +326,21 @@ class _Readings(Mapping[str, Any]):
         self._open = False
 
 
-def _policy_selector(simulator: Simulator, policy: str, number: int) -> Selector:
-    """Return a selector of the agents that follow a policy by their episode and that no other driver controls."""
-    follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
-    for row, episode in zip(follows_policy, simulator.episodes, strict=True):
-        row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
+class _PolicySelector:
+    """Selector of the agents that follow a policy by their episode and that no other driver controls.
 
-    def choose(state: WorldState) -> Bool:
-        free = (state.policy < 0) | (state.policy == number)
-        return np.asarray(follows_policy[simulator.assigned] & free & state.active)
+    It is an object and no closure, so that the copy of a loop asks the copy of its simulator.
+    """
 
-    return choose
+    def __init__(self, simulator: Simulator, policy: str, number: int) -> None:
+        self._simulator, self._number = simulator, number
+        self._follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
+        for row, episode in zip(self._follows_policy, simulator.episodes, strict=True):
+            row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
+
+    def __call__(self, state: WorldState) -> Bool:
+        free = (state.policy < 0) | (state.policy == self._number)
+        return np.asarray(self._follows_policy[self._simulator.assigned] & free & state.active)
 
 
 def _check_believer(simulator: Simulator, selector: int | Selector, driver: Driver) -> None:

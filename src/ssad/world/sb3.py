@@ -62,8 +62,11 @@ class SB3VecEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-basel
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
 
     def reset(self) -> npt.NDArray[np.float32]:
-        """Start all scenes, sampling their episodes with the seed given to `seed`, if any."""
-        observation, _ = self.environment.reset(seed=self._seeds[0])
+        """Start all scenes with the seed given to `seed` and the scenario given to `set_options`, if any."""
+        given = {key for options in self._options for key in options}
+        # Scenes to which `set_options` gives no scenario draw theirs.
+        options = {key: [options.get(key) for options in self._options] for key in given}
+        observation, _ = self.environment.reset(seed=self._seeds[0], options=options)
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0

@@ -61,6 +61,10 @@ class Window:
         self._surface: Any = None
         self._rate = rate
 
+    def __reduce__(self) -> tuple[type[Window], tuple[float]]:
+        """Copies of an environment share no window: each opens its own with its first image."""
+        return Window, (self._rate,)
+
     def show(self, image: U8) -> None:
         """Show a picture, RGB [H, W, 3], no sooner than the rate allows."""
         if self._surface is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,12 +30,21 @@ def launcher(world: World, kernel: Any, agents: I32, shape: tuple[int, ...], dim
     ), output
 
 
-def _rows(kernel: Any, width: int, part: slice) -> Sensor:
-    def read(simulator: Any, agents: I32) -> F32:
-        table = _read(simulator, kernel, agents, (len(agents), width), len(agents))
-        return table[:, part].copy()
+@dataclass(frozen=True)
+class _Rows:
+    """Sensor of columns of an observation kernel, an object so that loops with it can be pickled."""
 
-    return read
+    kernel: str
+    width: int
+    first: int
+    end: int
+
+    def __call__(self, simulator: Any, agents: I32) -> F32:
+        table = _read(simulator, _KERNELS[self.kernel], agents, (len(agents), self.width), len(agents))
+        return table[:, self.first : self.end].copy()
+
+
+_KERNELS = {"look": look, "look_as_adversary": look_as_adversary}
 
 
 def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> F32:
@@ -55,6 +65,20 @@ def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim:
     return np.asarray(values)
 
 
+@dataclass(frozen=True)
+class _RasterView:
+    """Sensor of the view from above; see `from_above`."""
+
+    side: int
+    pixels: float
+    behind: float
+
+    def __call__(self, simulator: Any, agents: I32) -> F32:
+        count, side = len(agents), self.side
+        shape, dim = (count, CHANNELS, side, side), (count, side, side)
+        return _read(simulator, look_from_above, agents, shape, dim, side, self.pixels, self.behind).copy()
+
+
 def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND) -> Sensor:
     """A rasterised view from above, [N, 4, side, side] in the agent's frame, forward up.
 
@@ -65,13 +89,7 @@ def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND
         pixels: Pixels a metre.
         behind: Metres that are seen behind the agent's centre.
     """
-
-    def read(simulator: Any, agents: I32) -> F32:
-        count = len(agents)
-        shape = (count, CHANNELS, side, side)
-        return _read(simulator, look_from_above, agents, shape, (count, side, side), side, pixels, behind).copy()
-
-    return read
+    return _RasterView(side, pixels, behind)
 
 
 def truth(simulator: Any, agents: I32) -> Belief:
@@ -89,9 +107,9 @@ def traffic(simulator: Any, agents: I32) -> F32:
 
 
 SENSORS: dict[str, Sensor] = {
-    "safebench": _rows(look, OBSERVATION, slice(0, 4)),
-    "frea": _rows(look, OBSERVATION, slice(4, OBSERVATION)),
-    "adversary": _rows(look_as_adversary, 24, slice(0, 24)),
+    "safebench": _Rows("look", OBSERVATION, 0, 4),
+    "frea": _Rows("look", OBSERVATION, 4, OBSERVATION),
+    "adversary": _Rows("look_as_adversary", 24, 0, 24),
     "traffic": traffic,
     "above": from_above(),
     "truth": truth,

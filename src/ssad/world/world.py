@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,12 @@ VERSION = "6"  # part of every cell's key: raise it when the same episode no lon
 _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
 # The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
 _OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
+_IMMUTABLE = ("episodes", "graphs", "models", "bank")  # attributes that deep copies share
+# Attributes that live on the device or refer to it: a copy makes its own.
+_ON_DEVICE = (
+    *("arrays", "seen", "ego", "controls", "places", "_mask", "work", "noise", "_views", "_looks"),
+    *("_restart", "_see", "_plan", "_advance", "_graph"),
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,9 @@ class World:
     """Batch of episodes that run side by side. Implements `Simulator` of `ssad.core.driving`, and `Reproducible`.
 
     The bits of a scene depend on its episode and controls alone: not on the batch, its order or the other scenes.
+
+    Worlds deep-copy and pickle, in the midst of an episode too, and a copy continues to the bit. Deep copies share the
+    bank of episodes, which never changes; an unpickled world builds it again, on the same device.
 
     Args:
         episodes: The bank of episodes.
@@ -86,6 +96,8 @@ class World:
         self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt
         self.device = device
+        self.models: Mapping[str, Model] = dict(models)
+        self._ego_controller = ego
         self.bank = build(self.episodes, graphs, device, ego, models)
         # All scenes have as many slots as the widest episode; the others leave theirs empty.
         self.agents = self.bank.agents
@@ -96,6 +108,15 @@ class World:
         # A pair of agents is stored as one int32 code, with two more bits for its flags.
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
+        self._lanes: dict[str, Lanes] = {}
+        self._settings = (dt, substeps, autoreset)
+        self.chance = noise
+        self._allocate(assignment.astype(np.int32), believed=0)
+        self.reset()
+
+    def _allocate(self, assignment: I32, *, believed: int) -> None:
+        """Make all arrays and launches, with room for that many objects of a belief in each scene."""
+        device = self.device
         self.belief_capacity = 0  # room for objects of a belief in each scene
         self._views: dict[str, npt.NDArray[Any]] = {}
         self.arrays = State()
@@ -103,7 +124,6 @@ class World:
         for name, array_type in _STATE.items():
             setattr(self.arrays, name, wp.zeros(shape[: array_type.ndim], dtype=array_type.dtype, device=device))
         self.seen = PerceivedAgents()
-        self._lanes: dict[str, Lanes] = {}
         self.ego = Ego()
         for name, array_type in _EGO.items():
             setattr(self.ego, name, wp.zeros(self.batch, dtype=array_type.dtype, device=device))
@@ -114,13 +134,44 @@ class World:
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
-        self._settings = (dt, substeps, autoreset)
-        self.chance = noise
-        if noise is not None:
-            self.noise = noise_state(noise, self.episodes, assignment.astype(np.int32), self.agents, device)
-        self._assign(assignment.astype(np.int32))
-        self._make_room(0)
-        self.reset()
+        if self.chance is not None:
+            self.noise = noise_state(self.chance, self.episodes, assignment, self.agents, device)
+        self._assign(assignment)
+        self._make_room(believed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what pickle stores: arguments, and host copies of the arrays. ConfigError after `capture`."""
+        return self._host_state(leave_out=(*_ON_DEVICE, "bank"))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the world anew from what `__getstate__` returned."""
+        start_warp_quietly()
+        arrays = state["saved_arrays"]
+        self.__dict__.update({name: value for name, value in state.items() if name != "saved_arrays"})
+        if "bank" not in state:
+            self.bank = build(self.episodes, self.graphs, self.device, self._ego_controller, self.models)
+        self._allocate(arrays["episode"], believed=self.belief_capacity)
+        for name, value in arrays.items():
+            self.put(name, value)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> World:
+        """Return a world that continues as this one does; episodes, graphs and the bank are shared."""
+        duplicate = object.__new__(type(self))
+        memo[id(self)] = duplicate
+        # Drivers and views that hold a town or an episode share it too.
+        shared = [getattr(self, name) for name in _IMMUTABLE]
+        for constant in (*shared, *self.episodes, *self.graphs.values()):
+            memo[id(constant)] = constant
+        duplicate.__setstate__(copy.deepcopy(self._host_state(leave_out=_ON_DEVICE), memo))
+        return duplicate
+
+    def _host_state(self, *, leave_out: Sequence[str]) -> dict[str, Any]:
+        """Return attributes by name, and all arrays that hold something from one step to the next."""
+        if self._graph is not None:
+            raise ConfigError("a world with a captured CUDA graph cannot be copied; copy it, then call capture()")
+        names = (*self.names, *(f"seen.{name}" for name in _SEEN), "controls", "places")
+        attributes = {name: value for name, value in self.__dict__.items() if name not in leave_out}
+        return attributes | {"saved_arrays": {name: self.array(name).copy() for name in names}}
 
     def _make_room(self, believed: int) -> None:
         """Room for that many objects of a belief in each scene, and the launches of a step, which refer to it."""

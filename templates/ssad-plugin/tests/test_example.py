@@ -69,6 +69,91 @@ def test_the_detector_keeps_its_promises_and_the_attack_its_budget() -> None:
     assert float(done.after) > float(done.before)
 
 
+def test_the_loss_lowers_scores_behind_the_defence() -> None:
+    torch = pytest.importorskip("torch")
+    from ssad import make_detector
+    from ssad.core.detections import Truth
+    from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
+    from ssad.scenarios.static.digital.defences import Defended, make_defence
+
+    grey = make_defence("example-grey", share=1.0)
+    image = torch.randint(0, 256, (1, 3, 64, 96), generator=torch.Generator().manual_seed(0)) / 255
+    np.testing.assert_allclose(grey(image).std(1), 0.0, atol=1e-6)
+    detector, truth = make_detector("yolov5n"), [Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4))]
+    done = run_attack(
+        make_attack("example-steps"), detector, image, truth, Budget(px(5)), objective="example-top?places=5"
+    )
+    assert float(done.after) > float(done.before)
+    scores = [float(detector.dense(images).logit.sigmoid().amax()) for images in (image, done.images)]
+    assert scores[1] < scores[0]
+    assert Defended(detector, grey).name == "yolov5n+grey-1"
+
+
+def test_the_shift_and_the_sticker_get_stronger_with_their_severity() -> None:
+    pytest.importorskip("torch")
+    from ssad.scenarios.static.catalogue import parse_perturbation
+
+    black = np.zeros((1, 60, 60, 3), np.uint8)
+    hazes = [parse_perturbation("example-haze").make(severity).shift for severity in (1, 5)]
+    brightness = [haze.shift(black, [], []).mean() for haze in hazes]
+    assert 0.0 < brightness[0] < brightness[1] < 255.0
+    stickers = [parse_perturbation("example-sticker").make(severity) for severity in (1, 5)]
+    covered = [(sticker.apply(black.transpose(0, 3, 1, 2), None, None, None) > 0).mean() for sticker in stickers]
+    assert 0.0 < covered[0] < covered[1] < 1.0
+    assert stickers[0].family == "occlusion"
+
+
+def test_the_light_shines_on_the_rear_and_the_texture_has_its_settings() -> None:
+    pytest.importorskip("torch")
+    from ssad.scenarios.static.physical import make_physical
+    from ssad.scenarios.static.physical.lights import TargetSize, make_light
+
+    light, target = make_light("example-spot", {"lumens": 500.0}), TargetSize(4.5, 1.8, 1.5)
+    assert light.ranges(target)["lumens"] == (0.0, 500.0)
+    (lamp,) = light.edit({"lumens": 400.0, "aim_up": 1.0}, target).lamps
+    assert (lamp.power, lamp.pose[0, 3]) == (400.0, target.rear - 8.0)
+    assert make_physical("example-pale", epochs=3).epochs == 3
+
+
+def test_the_simulator_keeps_its_protocol_and_its_brakes_are_worn() -> None:
+    from ssad import build_episode, load_scenarios, load_town, make_system, rollout
+    from ssad.simulators.closed_loop import make_simulator
+    from ssad.world.check import check_simulator
+
+    (scenario,) = load_scenarios("ExampleWalkers")  # the class brings one
+    town = load_town(scenario.town)
+    episode = build_episode(scenario, town, seed=0)
+
+    def simulator(assign):
+        from ssad_example.simulator import WornBrakes
+
+        return WornBrakes([episode] * 2, {town.name: town}, assign=np.array(assign))
+
+    check_simulator(simulator, episodes=2, steps=10)
+    collides = {}
+    for name in ("embedded", "example-worn-brakes?brake=0.05"):
+        world = make_simulator(name, [episode], {town.name: town}, device="cpu")
+        (trace,) = rollout(world, make_system("example-careful"))
+        collides[name] = bool(trace.contact.any())
+    assert list(collides.values()) == [False, True]
+
+
+def test_the_planner_keeps_its_protocol() -> None:
+    pytest.importorskip("torch")
+    from ssad import World, build_episode, load_scenarios, load_town
+    from ssad.drivers.perceiving.check import check_planner
+    from ssad.drivers.perceiving.parts import make_planner
+
+    scenarios = load_scenarios("LaneChanging")[:2]
+    town = load_town(scenarios[0].town)
+    episodes = [build_episode(scenario, town, seed=0) for scenario in scenarios]
+
+    def simulator(assign):
+        return World(episodes, {town.name: town}, assign=np.array(assign))
+
+    check_planner(lambda: make_planner("example-brake", reach=10.0), simulator, episodes=2, steps=10)
+
+
 def test_the_perceiver_and_the_tracker_keep_their_protocols() -> None:
     pytest.importorskip("torch")
     from ssad import World, build_episode, load_scenarios, load_town

@@ -138,7 +138,7 @@ def test_each_scenario_is_built_once_to_check_it(monkeypatch: pytest.MonkeyPatch
         if cell.name.endswith("worse"):
             raise RouteError("scenario worse: no way")
 
-    replace_name(monkeypatch, "episode_of", build)
+    replace_name(monkeypatch, "build_requested_episode", build)
     plan_of(monkeypatch, scenario("a"), scenario("b"), repetitions=3, check=True)
     assert built == ["autopilot/a", "autopilot/b"]
     for name in ("bad", "worse"):

@@ -15,16 +15,19 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.shifted_roots import SCENES, VERSION, edit, fails, first, lines, options, table, tree
+from PIL import Image
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.images import decode_image, encode_jpeg, read_image
-from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_points
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.point_files import PointFile, encode_points_like
 from ssad.recorders.shifted import SceneShifter, check_manifest, verify, write_shifted_roots
 from ssad.recorders.shifted import scene_writer as work
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, transformed_boxes
 
+PCD_COLUMNS = ("x", "y", "z", "intensity", "ring")
 HELPER = Path(__file__).resolve().parents[2] / "helpers" / "devkit_load.py"
 
 
@@ -420,3 +423,69 @@ def test_nothing_is_written_through_a_link_into_the_dataset(clean: Path, tmp_pat
             StoreError, lambda o=out: write_shifted_roots(options(clean, o), workers=0), name, "leads into the dataset"
         )
     assert tree(clean) == before
+
+
+# ---------------------------------------------------------------- other formats
+
+
+def _rename(root: Path, old: str, new: str) -> None:
+    """Change a file name in the tables."""
+    table = root / VERSION / "sample_data.json"
+    table.write_text(table.read_text().replace(old, new))
+
+
+def test_images_and_sweeps_of_other_formats_are_shifted_in_their_own(source: Path, tmp_path: Path) -> None:
+    """A turned and a grey JPEG, a WebP and a PCD in a nuScenes folder."""
+    turned, grey, webp = sorted(source.glob("samples/CAM_FRONT/*.jpg"))[:3]
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.open(turned).save(turned, exif=exif)
+    Image.open(grey).convert("L").save(grey)
+    Image.open(webp).save(webp.with_suffix(".webp"))
+    webp.unlink()
+    _rename(source, webp.name, f"{webp.stem}.webp")
+    for sweep in sorted(source.glob("s*/LIDAR_TOP/*.pcd.bin")):
+        points = read_points(sweep)
+        as_pcd = PointFile(points, "pcd", False, tuple((name, np.dtype("<f4")) for name in PCD_COLUMNS))
+        sweep.with_name(sweep.name.removesuffix(".bin")).write_bytes(encode_points_like(as_pcd, points))
+        sweep.unlink()
+    _rename(source, ".pcd.bin", ".pcd")
+    (written,) = write_shifted_roots(options(source, tmp_path / "o", "fog", sweeps=False), workers=0)
+    assert (written.reasons, written.failed) == ((), 0)
+    root = written.root
+    with Image.open(root / turned.relative_to(source)) as image:
+        assert image.getexif()[0x0112] == 3
+    clean_scene = NuScenes(source, VERSION).scene(SCENES[0])
+    frame = next(frame for frame in clean_scene.frames if frame.filename.endswith(turned.name))
+    stored, fogged = (read_frame_image(place, frame) for place in (source, root))
+    with Image.open(turned) as image:
+        assert np.array_equal(stored, np.asarray(image)), "the camera matrix is that of the stored pixels"
+    differences = [np.abs(stored.astype(int) - image).mean() for image in (fogged, fogged[::-1, ::-1])]
+    assert differences[0] < differences[1], "it is not turned against the clean one"
+    with Image.open(root / grey.relative_to(source)) as image:
+        assert image.mode == "L"
+    with Image.open((root / webp.relative_to(source)).with_suffix(".webp")) as image:
+        assert image.format == "WEBP"
+    for sweep in source.glob("samples/LIDAR_TOP/*.pcd"):
+        shifted = root / sweep.relative_to(source)
+        assert shifted.read_bytes().startswith(b"# .PCD")
+        assert read_points(shifted)[:, 3].mean() < 0.9 * read_points(sweep)[:, 3].mean()
+    assert verify(root)[1] == []
+
+
+def test_a_nuscenes_folder_with_links_inside_has_no_clean_files_beside_the_shifted(
+    source: Path, tmp_path: Path
+) -> None:
+    expected = tree(write_shifted_roots(options(source, tmp_path / "plain", "uniform"), workers=0)[0].root / "samples")
+    (source / "store").mkdir()
+    shutil.move(source / "samples", source / "store" / "samples")
+    (source / "samples").symlink_to("store/samples")
+    shutil.move(source / "sweeps" / "CAM_BACK", source / "back")
+    (source / "sweeps" / "CAM_BACK").symlink_to("../back")
+    (written,) = write_shifted_roots(options(source, tmp_path / "linked", "uniform"), workers=0)
+    assert written.reasons == ()
+    assert not (written.root / "store").exists()
+    assert not (written.root / "back").exists()
+    assert (written.root / "maps").exists()
+    assert tree(written.root / "samples") == expected
+    assert not any((written.root / folder).is_symlink() for folder in ("samples", "sweeps", "sweeps/CAM_BACK"))

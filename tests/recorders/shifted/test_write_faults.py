@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.shifted_roots import SCENES, VERSION, edit, fails, first, lines, options, table, tree
+from PIL import Image
 
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.images import encode_jpeg
@@ -56,13 +57,14 @@ def _wrong_size(path: Path) -> None:
     path.write_bytes(encode_jpeg(np.zeros((90, 160, 3), np.uint8)))
 
 
-def _grey(path: Path) -> None:
-    path.write_bytes(cv2.imencode(".jpg", np.zeros((180, 320), np.uint8))[1].tobytes())
+def _moving(path: Path) -> None:
+    frame = Image.new("RGB", (320, 180), "grey")
+    frame.save(path, "WEBP", save_all=True, append_images=[Image.new("RGB", (320, 180), "red")])
 
 
 @pytest.mark.parametrize(
     ("shift", "damage"),
-    [("fog", _missing), ("snow", _truncated), ("sunlight", _wrong_size), ("scale", _empty), ("gaussian", _grey)],
+    [("fog", _missing), ("snow", _truncated), ("sunlight", _wrong_size), ("scale", _empty), ("gaussian", _moving)],
 )
 def test_a_broken_image_is_on_record_and_mending_it_completes(
     source: Path, tmp_path: Path, shift: str, damage: Callable[[Path], None]

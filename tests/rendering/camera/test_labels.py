@@ -196,7 +196,7 @@ def test_labels_are_the_same_each_time_and_in_any_order() -> None:
     first, _ = seen(*things)
     again, _ = seen(*things)
     turned, _ = seen(*things[::-1])
-    for name in ("tag", "box", "pixels", "share", "inside"):
+    for name in ("tag", "box", "pixels", "share", "image_share"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
         assert np.array_equal(getattr(first, name), getattr(turned, name))
 

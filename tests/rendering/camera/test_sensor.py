@@ -447,7 +447,7 @@ def test_a_texture_is_put_into_the_window_alone(stage: RenderScene) -> None:
     for small in (True, False):
         leaf = colours.clone().requires_grad_()
         if small:
-            part = retexture(window.taps(taps), leaf, window.crop(radiance))
+            part = retexture(window.relative_taps(taps), leaf, window.crop(radiance))
             shown = window.paste(window.develop(part, exposure), base)
         else:
             shown = jpeg(develop(retexture(taps, leaf, radiance), exposure))
@@ -489,7 +489,7 @@ def test_wrong_use_is_refused_in_one_line(stage: RenderScene) -> None:
         lambda: ChangedWindow.around(torch.tensor([2 * 53 * 72]), SHAPE, SensorModel()),
         lambda: ChangedWindow.around(flat((0, 20, 30)), SHAPE, SensorModel(), quality=101),
         lambda: window.crop(radiance[:1]),
-        lambda: window.taps(far),
+        lambda: window.relative_taps(far),
     ):
         with pytest.raises(ConfigError) as error:
             call()

@@ -63,7 +63,6 @@ def test_no_green_to_crossing_approaches_in_carla_towns(carla_home: Path, name: 
 
 def test_a_map_that_shows_green_to_all_is_put_right(tmp_path: Path) -> None:
     """Controllers of a junction that share lights of crossing arms are not followed."""
-    pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")
     text = generate_town("Twinford")
     path = tmp_path / "Twinford.xodr"
     groups = re.findall(r"<controller name=.*?</controller>", text, flags=re.DOTALL)

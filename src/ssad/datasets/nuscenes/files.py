@@ -1,7 +1,4 @@
-"""LiDAR sweeps of a nuScenes folder: checked reading, and encoding.
-
-Sweeps are float32 [N, 5]: x, y, z in metres in the sensor's frame, intensity, ring.
-"""
+"""Files of a nuScenes folder: camera images in the frame of the tables, and LiDAR sweeps."""
 
 from __future__ import annotations
 
@@ -10,30 +7,34 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.errors import FormatError
-from ssad.core.safeio import read_bytes
-from ssad.core.types import F32
+from ssad.core.image_files import ImageFile, read_image_file
+from ssad.core.images import annotated_pixels
+from ssad.core.types import U8
+from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.point_files import read_points
+
+__all__ = ["POINT_BYTES", "points_bytes", "read_frame_file", "read_frame_image", "read_points"]
 
 POINT_BYTES = 20
 
 
-def read_points(path: str | Path) -> F32:
-    """Read a LiDAR sweep (.pcd.bin).
+def read_frame_image(root: Path, frame: SensorFrame) -> U8:
+    """Read the image of a camera as uint8 [H, W, 3] RGB, in the frame that its camera matrix refers to.
 
-    Returns:
-        Points, float32 [N, 5].
+    Args:
+        root: The nuScenes root.
+        frame: A file of a camera.
 
     Raises:
-        FormatError: The file is missing, has a size that does not fit, or holds values that are not finite.
+        FormatError: The file cannot be read, or its size contradicts the tables.
     """
-    content = read_bytes(path, limit=1 << 28)
-    if len(content) % POINT_BYTES:
-        raise FormatError(f"{path}: {len(content)} bytes are no whole number of {POINT_BYTES}-byte points (cut short?)")
-    points = np.frombuffer(content, "<f4").reshape(-1, 5).astype(np.float32)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        raise FormatError(f"{path}: point {int(np.argmin(finite))} is not finite")
-    return points
+    return read_frame_file(root, frame)[1]
+
+
+def read_frame_file(root: Path, frame: SensorFrame) -> tuple[ImageFile, U8]:
+    """The same with the content of the file, whose format a shifted image takes over."""
+    image_file = read_image_file(root / frame.filename)
+    return image_file, annotated_pixels(image_file, width=frame.width, height=frame.height)
 
 
 def points_bytes(points: npt.ArrayLike) -> bytes:

@@ -215,13 +215,13 @@ class TwoStage(Adapter):
         """Return label, owner [B, K] and target [B, K, 4] (in the network's input) of the proposals."""
         rows = []
         for image_index, object_count in enumerate(targets.real.sum(1).tolist()):
-            filled, proposals = dense.maps["filled"][0][image_index], dense.maps["proposals"][0][image_index]
+            is_filled, proposals = dense.maps["filled"][0][image_index], dense.maps["proposals"][0][image_index]
             if not object_count:
-                no_owner = torch.full_like(filled, -1, dtype=torch.int64)
-                rows.append((no_owner.masked_fill(~filled, -2), no_owner, torch.zeros_like(proposals)))
+                no_owner = torch.full_like(is_filled, -1, dtype=torch.int64)
+                rows.append((no_owner.masked_fill(~is_filled, -2), no_owner, torch.zeros_like(proposals)))
                 continue
             box = targets.box[image_index, :object_count]
-            overlap = box_iou(box, proposals).masked_fill(~filled, 0.0)
+            overlap = box_iou(box, proposals).masked_fill(~is_filled, 0.0)
             owner = self.model.roi_heads.proposal_matcher(overlap)
             largest_overlap, best_proposal = overlap.max(1)
             # The source adds true boxes to the proposals instead, so that no object goes unmatched.
@@ -229,7 +229,7 @@ class TwoStage(Adapter):
                 largest_overlap > 0
             ]
             label, owner = labels_and_owners(
-                owner.masked_fill(~filled, -2), object_labels[image_index], targets.crowd[image_index]
+                owner.masked_fill(~is_filled, -2), object_labels[image_index], targets.crowd[image_index]
             )
             rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))
         label, owner, target = (torch.stack(column) for column in zip(*rows, strict=True))

@@ -157,7 +157,7 @@ def wrong_side(episode: Episode, graph: LaneGraph) -> Bool:
     """Return which lanes of a town are on the other side of the roads on the ego's route."""
     route = episode.agents[0].route
     assert route is not None
-    direction = np.sign(graph.lane_id)
+    direction = graph.forward
     ego_sides = {(int(graph.road[lane]), int(direction[lane])) for lane in np.unique(route.lane[route.lane >= 0])}
     roads = {road for road, _ in ego_sides}
     pairs = list(zip(graph.road.tolist(), direction.tolist(), strict=True))

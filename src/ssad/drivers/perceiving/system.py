@@ -14,6 +14,8 @@ from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
+from ssad.core.source import plugin_version
+from ssad.detectors import DETECTORS
 from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent, TrackingEvent
 from ssad.drivers.perceiving.parts import (
     Perceiver,
@@ -108,9 +110,12 @@ class PerceivingSystem(Schema):
 
     @property
     def version(self) -> str:
-        """Hash of the weights of its detector, and the versions of the parts that are named; "" without any."""
+        """Hashes of the weights and source of its detector, and versions of the parts that are named; "" without."""
         built_in_detector = self.perceiver is None and not self.is_perfect
-        versions = [state_hash(self._make_perceiver().detector)] if built_in_detector else []
+        versions = []
+        if built_in_detector:
+            versions.append(state_hash(self._make_perceiver().detector))
+            versions.append(plugin_version("detector", DETECTORS, self.detector))
         for kind in NAMED:
             name, options = self._part(kind)
             if name:

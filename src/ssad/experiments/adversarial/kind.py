@@ -14,6 +14,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
+from ssad.core.registry import label_of
 from ssad.core.run_records import COUNT, NOT_NEGATIVE, SHARE
 from ssad.core.safeio import to_plain_json
 from ssad.core.source import source_version
@@ -42,7 +43,7 @@ class AdversarialSuite(ScenarioSuite):
 
     Attributes:
         systems: Driving systems under test.
-        generators: Names, or module:object.
+        generators: Names, or module:object; arguments and a label may follow, as for systems.
         budget: Rollouts that a generator may spend on a base.
         batch: Rollouts that it proposes at once.
         repetitions: Searches of each, with seeds of their own.
@@ -131,9 +132,11 @@ class Adversarial(ScenarioKind):
                 generators[generator],
                 *transfer_versions,
                 system=system,
-                title=f"{generator}/{system}/{scenario.scenario.name}{f'#{repetition}' if repetition else ''}",
+                title=(
+                    f"{label_of(generator)}/{system}/{scenario.scenario.name}{f'#{repetition}' if repetition else ''}"
+                ),
                 chance=("adversarial", repetition),
-                fields={"generator": generator},
+                fields={"generator": label_of(generator)},
                 generator=generator,
                 repetition=repetition,
                 budget=suite.budget,
@@ -155,7 +158,7 @@ class Adversarial(ScenarioKind):
 
     def alike(self, cell: Cell) -> Hashable:
         """Return generator and system: the generator works on the bases of one system side by side."""
-        return cell.fields["generator"], cell.system
+        return cell.spec["generator"], cell.system
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Run one generator on the bases that the system survives."""
@@ -233,7 +236,7 @@ class Adversarial(ScenarioKind):
     ) -> tuple[dict[str, Any], list[Scenario]]:
         """Write the most distinct collisions as scenarios, and the trace of the first."""
         suffix = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
-        stem = f"{base.scenario.name}/{cell.spec['generator']}{suffix}"
+        stem = f"{base.scenario.name}/{cell.fields['generator']}{suffix}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
         collisions, saved_scenarios = saved_collisions(
             folder / artefacts["scenarios"], base, row, limit=cell.spec["keep"], stem=stem

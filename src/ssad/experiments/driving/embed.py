@@ -149,7 +149,7 @@ def _line_codes(graph: LaneGraph, lane: int) -> list[int]:
             line_codes.append(0)
         elif neighbour < 0 or graph.kind[neighbour] != LaneType.DRIVING:
             line_codes.append(2)
-        elif np.sign(graph.lane_id[neighbour]) == np.sign(graph.lane_id[lane]):
+        elif graph.forward[neighbour] == graph.forward[lane]:
             line_codes.append(1)
         else:
             line_codes.append(3)

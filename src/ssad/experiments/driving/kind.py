@@ -26,16 +26,17 @@ from ssad.metrics.driving import LIMITS
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.simulators.closed_loop import (
+    EMBEDDED,
     HIGHWAY_TYPE,
     build_requested_episode,
     drive,
     grade_of,
+    is_carla,
     runs_embedded,
     runs_in_highway_env,
+    simulator_version,
     system_version,
 )
-
-EMBEDDED = "embedded"  # the name of SSAD's own world as a simulator
 
 
 class DrivingSuite(ScenarioSuite):
@@ -43,7 +44,8 @@ class DrivingSuite(ScenarioSuite):
 
     Attributes:
         systems: names, or module:object; arguments and a label may follow, as in mine:Mine?checkpoint=a.pt@first.
-        simulator: SSAD's own world, embedded, or a CARLA server, carla://HOST:PORT (docs/how-to/use-carla.md).
+        simulator: SSAD's own world, embedded, a CARLA server, carla://HOST:PORT (docs/how-to/use-carla.md), or
+            module:object.
         repetitions: episodes of each pair; the first is the nominal case.
         spread: how far the other repetitions are drawn around it, 1 being the natural spread
             (docs/reference/scenarios.md); 0: not at all, then scenarios without traffic of their own give copies,
@@ -80,13 +82,16 @@ class Driving(ScenarioKind):
         check_distinct(suite, "systems", suite.systems)
         systems = {name: system_version(name) for name in suite.systems}
         scenarios, towns = describe_scenarios(suite)
-        remote_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
-        if remote_spec:
+        simulator_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
+        inputs = []
+        if simulator_spec and any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):
+            raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {suite.simulator}")
+        if not is_carla(suite.simulator):
+            inputs = [version] if (version := simulator_version(suite.simulator)) else []
+        else:
             from ssad.simulators.carla.server import Server, check_version
 
             server = Server.of(suite.simulator)
-            if any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):
-                raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {server}")
             if check:
                 check_version(server)
         # the seed does not depend on the system: systems meet the same episodes
@@ -95,12 +100,13 @@ class Driving(ScenarioKind):
                 suite,
                 scenario,
                 systems[system],
+                *inputs,
                 system=system,
                 chance=("episode", repetition),
                 title=f"{system}/{scenario.scenario.name}{f'#{repetition}' if repetition else ''}",
                 repetition=repetition,
                 spread=suite.spread if repetition else 0.0,
-                **remote_spec,
+                **simulator_spec,
             )
             for system in suite.systems
             for scenario in scenarios
@@ -119,17 +125,17 @@ class Driving(ScenarioKind):
             ConfigError: A CARLA server on a cluster.
         """
         super().prepare(plan, folder, resources)
-        if resources.ray and plan.suite.simulator != EMBEDDED:
+        if resources.ray and is_carla(plan.suite.simulator):
             raise ConfigError(f"suite {plan.suite.name}: one worker drives {plan.suite.simulator}; leave out --ray")
         return {"witness": plan.suite.witness}
 
     def workers(self, plan: Plan, requested: int | None) -> int | None:
         """Return one worker for a CARLA server, which runs one world."""
-        return requested if requested == 0 or plan.suite.simulator == EMBEDDED else 1
+        return 1 if requested != 0 and is_carla(plan.suite.simulator) else requested
 
     def alike(self, cell: Cell) -> Hashable:
         """Return system and simulator; CARLA drives one cell at a time."""
-        return cell.key if "simulator" in cell.spec else (cell.system, runs_in_highway_env(cell))
+        return cell.key if is_carla(cell.spec.get("simulator")) else (cell.system, runs_in_highway_env(cell))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drive the episodes as one batch of the world, measure them, write their traces."""

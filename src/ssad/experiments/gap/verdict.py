@@ -37,6 +37,7 @@ def verdict(run: Run) -> list[str]:
         )
         if not math.isnan(ap_change.mean) and not math.isnan(collision_change.mean):
             remark = "" if _has_interval(ap_change) or _has_interval(collision_change) else ", too few for intervals"
+            drives = "drive" if collision_change.n == 1 else "drives"
             change_text = (
                 f"{perturbation} {severity} changes the AP of {system} by {_interval_text(ap_change)} and its "
                 "collision rate by "
@@ -44,7 +45,7 @@ def verdict(run: Run) -> list[str]:
             sentences_by_system[system].append(
                 (
                     abs(collision_change.mean),
-                    f"{change_text}{_interval_text(collision_change)}, in {collision_change.n} drives{remark}.",
+                    f"{change_text}{_interval_text(collision_change)}, in {collision_change.n} {drives}{remark}.",
                 )
             )
     for system in systems:

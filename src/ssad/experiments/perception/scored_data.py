@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.registry import Reference, split_weights
 from ssad.core.schema import Names, Schema
-from ssad.core.source import source_version
+from ssad.core.source import plugin_version
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, ONNX, SHIPPED
@@ -123,9 +123,9 @@ def detectors_of(
             if class_name not in detector.classes:
                 raise ConfigError(f"suite {suite}: {name} has no class {class_name}, which wears a texture or light")
         # The hash of an export's state is that of its file.
-        is_module = ":" in detector_name and not detector_name.startswith(ONNX)
-        user_source = f" {source_version(detector_name.partition(':')[0])}" if is_module else ""
-        victims.weights[name], victims.files[name] = state_hash(detector) + user_source, path
+        is_export = detector_name.startswith(ONNX)
+        source = "" if is_export else plugin_version("detector", DETECTORS, detector_name)
+        victims.weights[name], victims.files[name] = " ".join(filter(None, (state_hash(detector), source))), path
         victims.tasks[name] = task
     return victims
 

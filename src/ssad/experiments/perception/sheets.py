@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from ssad.core.detections import to_images
-from ssad.core.images import read_image
 from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.datasets.drawing import title_on
 from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detectors.drawing import FOUND, TRUE, draw_flat, draw_solids
@@ -46,7 +46,7 @@ def detection_sheet(examination: Examination, split: str, perturbations: Sequenc
     detector = MonitoredDetector(detector_of(name, weights, examination.device)), examination.device
     with NuScenes(examination.root, examination.version) as dataset:
         scene, frame = frame_with_most_objects(dataset, scenes_of(dataset, split))
-        tiles = [draw_tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
+        tiles = [draw_tile(detector, scene, frame, read_frame_image(examination.root, frame), title="clean")]
         for perturbation in perturbations:
             condition = SceneCondition(scene.record.name, perturbation)
             recorded = replace(recorded_scene(examination, dataset, condition), folder=None)
@@ -72,7 +72,7 @@ def frame_with_most_objects(data: NuScenes, scenes: tuple[str, ...]) -> tuple[Sc
             truth = camera_truth(frame, scene.annotations(frame.sample_token))
             assert truth.solid is not None
             near_count = float((truth.solid.centre[:, 2] < 30).sum())
-            brightness = float(np.median(read_image(data.root / frame.filename)))
+            brightness = float(np.median(read_frame_image(data.root, frame)))
             # Dark images count less: boxes and changes are hard to see in them.
             rating = near_count * min(max(brightness - 20.0, 1.0) / 60.0, 1.0)
             if best_candidate is None or rating > best_candidate[0]:

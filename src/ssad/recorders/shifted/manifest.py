@@ -114,7 +114,7 @@ class ManifestCounts:
         return self.changed / max(self.images, 1)
 
 
-def page(
+def build_manifest(
     identity: Mapping[str, Any], source: Mapping[str, Any], tally: ManifestCounts, *, labels: str, transformed: str
 ) -> dict[str, Any]:
     """Build manifest.json of a complete root: identity, source, counts, and hashes of lines and new boxes."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from io import RawIOBase
 from pathlib import Path
 from typing import Any, Final
@@ -15,15 +16,18 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_links_above, open_inside
 from ssad.core.frames import ShiftReport
-from ssad.core.images import encode_jpeg
+from ssad.core.image_files import check_writable, encode_like, turn_upright
+from ssad.core.images import annotation_orientation
 from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import LIDAR
-from ssad.core.types import U8
-from ssad.datasets.nuscenes.files import points_bytes
+from ssad.datasets.nuscenes.files import read_frame_file
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.tables import BROKEN
+from ssad.datasets.point_files import encode_points_like, read_point_file
 from ssad.recorders.shifted.manifest import (
     FOLDER,
     STATES,
@@ -64,7 +68,7 @@ def read_finished_labels(root: Path, scene: str) -> SceneLabels | None:
         encoded = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
         labels = msgspec.json.decode(encoded, type=SceneLabels)
         return labels if labels.lines == digest_file(shard_path(root, scene)) else None
-    except (FormatError, msgspec.MsgspecError):
+    except (FormatError, *BROKEN):
         return None  # missing or damaged: the scene is checked again
 
 
@@ -148,11 +152,10 @@ def check_folders(root: Path, folders: Iterable[str | Path], source: Path) -> No
 @contextlib.contextmanager
 def _open_for_append(path: Path) -> Iterator[RawIOBase]:
     """Open a file to append whole lines; it is on disk when the block ends."""
-    try:
-        stream = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
-    except OSError as error:
-        raise _write_error(path, error) from None
-    with stream:
+    descriptor = open_inside(
+        path.parent.parent, f"{path.parent.name}/{path.name}", os.O_WRONLY | os.O_APPEND | os.O_CREAT
+    )
+    with open(descriptor, "ab", buffering=0) as stream:
         if stream.tell():
             _append(path, stream, None)  # ends a line that a kill may have truncated
         yield stream
@@ -224,12 +227,21 @@ def _unchanged_reason(shifter: SceneShifter, frame: SensorFrame) -> str:
 
 def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
-    clean_image = shifter.read(frame)
+    image_file, clean_image = read_frame_file(shifter.root, frame)
+    check_writable(image_file)
     image, applied = shifter.image(frame, clean=clean_image)
     if not applied.applied or np.array_equal(image, clean_image):
         return None, "", applied
     image = np.ascontiguousarray(image)
-    return _encode(image, shard, frame.filename), digest_bytes(image.data), applied
+    orientation = annotation_orientation(image_file, width=frame.width, height=frame.height)
+    encoded = encode_like(
+        image_file,
+        turn_upright(image, orientation),
+        quality=shard.options.quality,
+        subsampling=shard.subsampling,
+        compression=1,
+    )
+    return encoded, digest_bytes(image.data), applied
 
 
 def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
@@ -237,7 +249,10 @@ def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[by
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):
         return None, "", applied
-    encoded = points_bytes(points)
+    point_file = read_point_file(shifter.root / frame.filename)
+    if point_file.dropped_fields:
+        applied = replace(applied, details={**applied.details, "dropped_fields": list(point_file.dropped_fields)})
+    encoded = encode_points_like(point_file, points)
     return encoded, digest_bytes(encoded), applied
 
 
@@ -268,18 +283,6 @@ def _failed_line(shard: Shard, record: dict[str, Any], message: str) -> dict[str
     """Return the manifest line of a file that cannot be made, and remove any older version of it."""
     _remove(shard.root / record["file"])
     return record | {"state": "failed", "reason": message.replace(f"{shard.options.source}{os.sep}", "")}
-
-
-def _encode(image: U8, shard: Shard, name: str) -> bytes:
-    """Encode an image in the format of the original file."""
-    if name.lower().endswith(".png"):
-        succeeded, encoded = cv2.imencode(
-            ".png", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1]
-        )
-        if not succeeded:
-            raise FormatError(f"{name}: cannot be encoded as PNG")
-        return encoded.tobytes()
-    return encode_jpeg(image, shard.options.quality, shard.subsampling)
 
 
 def _link(shard: Shard, record: dict[str, Any], *, is_required: bool = True) -> dict[str, Any]:
@@ -332,6 +335,8 @@ def _write(root: Path, target: Path, data: bytes) -> None:
 def _replacement_path(root: Path, target: Path) -> Iterator[Path]:
     """Yield a path in the folder of unfinished files that replaces `target` if the block succeeds. StoreError."""
     temporary = _temporary(root)
+    check_links_above(target, root=root)
+    check_links_above(temporary, root=root)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.parent.mkdir(exist_ok=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import msgspec
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.folders import check_links_above
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
@@ -23,8 +26,8 @@ from ssad.recorders.shifted.manifest import (
     PAGE,
     TABLE,
     ManifestCounts,
+    build_manifest,
     digest_file,
-    page,
     read_lines,
     shard_path,
 )
@@ -128,21 +131,35 @@ def _open_root(options: Options, shift: str, severity: Strength, source: dict[st
     check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
     identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
     refusal = f"{root}: holds a shift of other data or options; choose another folder"
+    check_links_above(root, root=options.out, itself=True)
     claim(root / FOLDER / "identity.json", identity, refusal)
     try:
         (root / PAGE).unlink(missing_ok=True)  # the root is incomplete until this run finishes it
         _clear(root, options.version)
     except OSError as error:
         raise StoreError(f"{root}: cannot be written: {error.strerror or error}") from None
+    sensor_folders = _sensor_folders(options.source)
     for entry in sorted(options.source.iterdir()):
         if entry.name in ("samples", "sweeps", PAGE, FOLDER) or entry.name.startswith(("v1.0-", ".")):
             continue
+        if any(folder.is_relative_to(os.path.realpath(entry)) for folder in sensor_folders):
+            continue  # `samples` leads into it: a link to it would put the clean files beside the shifted ones
         link(root, entry, root / entry.name)
     # The annotation tables are written at the end; all other tables are linked.
     annotation_tables = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
     for table in sorted((options.source / options.version).glob("*.json")):
         if table.name not in annotation_tables:
             link(root, table, root / options.version / table.name)
+
+
+def _sensor_folders(source: Path) -> set[Path]:
+    """Return the real folders of the files of sensors, which symbolic links may lead to: of channels and of files."""
+    folders = [source / name for name in ("samples", "sweeps")]
+    channels = [channel for folder in folders if folder.is_dir() for channel in folder.iterdir() if channel.is_dir()]
+    first_files = [file for channel in channels for file in islice(channel.iterdir(), 1)]
+    return {Path(os.path.realpath(path)) for path in (*folders, *channels)} | {
+        Path(os.path.realpath(file)).parent for file in first_files
+    }
 
 
 def _clear(root: Path, version: str) -> None:
@@ -187,7 +204,7 @@ def _finish_root(
     shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     if not counts.reasons:
         identity = Shard(options, shift, severity, "").identity()
-        manifest = page(identity, source, counts, labels=options.labels, transformed=transformed)
+        manifest = build_manifest(identity, source, counts, labels=options.labels, transformed=transformed)
         safeio.write_atomic(root / PAGE, safeio.dump_json(manifest, indent=1) + "\n")
     states = counts.states
     return ShiftedRoot(

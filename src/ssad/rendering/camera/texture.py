@@ -96,7 +96,7 @@ class TexturedRendering(Protocol):
 
     @property
     def fragments(self) -> Any:
-        """As `Picture.fragments`."""
+        """As `Rendering.fragments`."""
 
 
 def texture_taps(
@@ -110,7 +110,7 @@ def texture_taps(
     """The taps of one texture in a picture.
 
     Args:
-        rendering: A `Picture`, or a part of one, rendered with things, decals or lamps that show the texture.
+        rendering: A `Rendering`, or a part of one, rendered with things, decals or lamps that show the texture.
         size: Height and width of the texture, or one side of a square, texels.
         texture: Its number.
         mask: Which texels [H, W] are somewhere on the surface (see `paint_mask`); None for all.

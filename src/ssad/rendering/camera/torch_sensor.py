@@ -431,7 +431,7 @@ class ChangedWindow:
             raise ConfigError(f"a window of pictures {list(self.shape)}, not {list(image.shape[:3])}")
         return torch.stack([entry[slice(*y), slice(*x)] for entry, (y, x) in zip(image, self.read, strict=True)])
 
-    def taps(self, taps: Taps) -> Taps:
+    def relative_taps(self, taps: Taps) -> Taps:
         """Return the taps with pixels relative to the radiance that `crop` returns.
 
         Args:

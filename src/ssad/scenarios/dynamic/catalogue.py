@@ -26,6 +26,9 @@ PRECRASH: tuple[str, ...] = tuple(SCENARIOS)[:8]
 CUSTOM = "Custom"
 """The type whose scenarios list their actors themselves."""
 
+TYPES: dict[str, str] = {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}
+"""All built-in types of scenarios."""
+
 
 def scenario_type(name: str) -> ScenarioType:
     """Return the scenario class with a name.
@@ -40,7 +43,7 @@ def scenario_type(name: str) -> ScenarioType:
         UnknownNameError: No class has that name; the message lists the closest ones.
         ConfigError: A user module fails to import, or the name refers to another object.
     """
-    resolved = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
+    resolved = resolve("scenario", TYPES, name)
     if not isinstance(resolved, ScenarioType):
         raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(resolved).__name__}")
     return resolved

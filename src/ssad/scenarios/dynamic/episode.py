@@ -10,7 +10,8 @@ import numpy as np
 
 from ssad.core.errors import RouteError
 from ssad.core.geometry import obb_distance
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import TURN, LaneGraph
+from ssad.core.rotations import wrap_scalar
 from ssad.core.safeio import dump_json
 from ssad.core.seeding import digest, generator
 from ssad.core.types import (
@@ -99,6 +100,11 @@ def _build_one(
     # A scenario with a fixed draw has the same traffic under every seed.
     draw = seed if fixed_draw is None else fixed_draw
     other_agents = scenario_kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
+    if scenario.signals.ego == "red" and not graph.turn_on_red[0] and near_side_turns(graph, route):
+        raise RouteError(
+            f"scenario {scenario.name}: its ego turns on red, which town '{graph.name}' forbids; choose another"
+            " town, or import its map with --turn-on-red"
+        )
     agents = (ego, *other_agents)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
     check_all = require_clearance and any(parameter.spread for parameter in scenario_kind.parameters)
@@ -169,7 +175,9 @@ def forced_signals(
         graph: Lane graph of the town.
         route: The ego's route.
         plan: State of the ego's signals (stop line on the route, or on a parallel lane of the same direction), and of
-            the other signals of the junctions on the route.
+            the other signals of the junctions on the route. Where the ego is to have red, only the junctions count at
+            which the route turns to the near side, which it may do on red; a route without such a turn has red
+            everywhere.
         whole_town: Apply the state of other signals to the whole map.
 
     Returns:
@@ -177,15 +185,17 @@ def forced_signals(
     """
     lanes = np.unique(route.lane[route.lane >= 0])
     approach = {
-        (int(graph.road[lane_index]), int(graph.section[lane_index]), int(np.sign(graph.lane_id[lane_index])))
+        (int(graph.road[lane_index]), int(graph.section[lane_index]), bool(graph.forward[lane_index]))
         for lane_index in lanes
     }
     ego_signals = {
         int(graph.stop_signal[stop_index])
         for stop_index, lane in enumerate(graph.stop_lane)
-        if (int(graph.road[lane]), int(graph.section[lane]), int(np.sign(graph.lane_id[lane]))) in approach
+        if (int(graph.road[lane]), int(graph.section[lane]), bool(graph.forward[lane])) in approach
     }
-    junctions = {int(lane_index) for lane_index in np.unique(graph.junction[lanes]) if lane_index >= 0}
+    junctions = {int(junction) for junction in np.unique(graph.junction[lanes]) if junction >= 0}
+    if plan.ego == "red":
+        junctions = near_side_turns(graph, route) or junctions
     forced_states: dict[int, SignalState] = {}
     for signal in range(len(graph.signal_junction)):
         on_route_junction = int(graph.signal_junction[signal]) in junctions
@@ -193,6 +203,20 @@ def forced_signals(
         if state_name != "program" and (not graph.signal_virtual[signal] if whole_town else on_route_junction):
             forced_states[signal] = _FORCED[state_name]
     return forced_states
+
+
+def near_side_turns(graph: LaneGraph, route: Route) -> set[int]:
+    """Return the junctions at which a route turns to the near side: right, or left in left-hand traffic."""
+    junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
+    edges = np.flatnonzero(np.diff(junction, prepend=-1, append=-1))
+    near_side = 1.0 if graph.left_hand[0] else -1.0
+    return {
+        int(junction[first])
+        for first, after in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+        if junction[first] >= 0
+        and near_side * wrap_scalar(float(route.yaw[min(after, len(junction) - 1)] - route.yaw[max(first - 1, 0)]))
+        > TURN
+    }
 
 
 def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent], *, movable: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from ssad.core.driving import Choice, Driver, Policies, Selector, Sensor, WorldS
 from ssad.core.errors import ConfigError, MissingExtraError, SSADError
 from ssad.core.generators import Base, Generator, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.registry import names, resolve
+from ssad.core.registry import Reference, check_arguments, names, resolve
 from ssad.core.types import AgentKind, Bool, Controller, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.frozen import freeze_episode
@@ -54,6 +54,9 @@ _STILL = 0.05  # m; an agent that moves less is no adversary
 def generator_factory(name: str) -> GeneratorFactory:
     """Return the factory of a generator by name, entry point, PREFIX:FILE or "module:object".
 
+    Args:
+        name: Its name; arguments and a label may follow, as in "mine:Search?step=0.1@fine".
+
     Raises:
         MissingExtraError: It needs an extra that is not installed.
         UnknownNameError: No generator has that name; the message lists the closest ones.
@@ -62,10 +65,30 @@ def generator_factory(name: str) -> GeneratorFactory:
     prefix, _, file = name.partition(":")
     if file and prefix in entry_points(group=FILE_GENERATORS).names:
         return cast(GeneratorFactory, resolve("generator_file", {}, prefix)(file))
-    resolved = resolve("generator", GENERATORS, name)
+    reference = Reference.parse(name)
+    resolved = resolve("generator", GENERATORS, reference.name)
     if not callable(resolved):
         raise ConfigError(f"generator '{name}': expected a class or function (bases, *, seeds, budget)")
-    return cast(GeneratorFactory, resolved)
+    if not reference.options:
+        return cast(GeneratorFactory, resolved)
+    check_arguments("generator", name, resolved, extra_arguments={"bases": (), "seeds": (), "budget": 0})
+    return _WithArguments(resolved, reference.options)
+
+
+class _WithArguments:
+    """Factory of a generator with further arguments; its other attributes are those of the generator."""
+
+    def __init__(self, factory: GeneratorFactory, arguments: Mapping[str, Any]) -> None:
+        self._factory, self._arguments = factory, arguments
+        self.__module__ = factory.__module__  # whose source is the version of the generator
+
+    def __call__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> Generator:
+        """Return a generator for some bases."""
+        return self._factory(bases, seeds=seeds, budget=budget, **self._arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the generator, such as its method `check`."""
+        return getattr(self._factory, name)
 
 
 def generator_list() -> dict[str, str]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.registry import names
 from ssad.core.safeio import home_folder
 from ssad.core.types import Scenario
-from ssad.scenarios.dynamic.catalogue import SCENARIOS
+from ssad.scenarios.dynamic.catalogue import SCENARIOS, scenario_type
 from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
@@ -30,7 +32,8 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
 
     A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, training, training-lanes, or one
     that was imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario class (its scenarios in
-    precrash and natural), a YAML file, or a folder of YAML files. UnknownNameError shows the three closest names.
+    precrash and natural, or those that a class of your own brings), a YAML file, or a folder of YAML files.
+    UnknownNameError shows the three closest names.
     """
     if isinstance(ref, Path) or ref.endswith(_SUFFIXES):
         return _from_path(Path(ref))
@@ -51,11 +54,28 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
         return (scenarios_by_name[ref],)
     if Path(ref).is_dir():  # last: a results folder called like a set must not hide it
         return _from_path(Path(ref))
+    if ":" in ref or ref in names("scenario", SCENARIOS):
+        return _of_class(ref)
     if ref.partition("/")[0] in IMPORTED:
         raise ConfigError(
             f"scenario '{ref}' is not in {home_folder() / 'scenarios'}; import it: ssad import routes FOLDER"
         )
     raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *scenarios_by_name])
+
+
+def _of_class(name: str) -> tuple[Scenario, ...]:
+    """Return the scenarios that a class of a package or of the user brings, each of the type by which it was named.
+
+    Raises:
+        ConfigError: It brings none.
+    """
+    scenarios = scenario_type(name).scenarios
+    if not scenarios:
+        raise ConfigError(
+            f"scenario class '{name}' brings no scenarios: name a YAML file whose scenarios have `type: {name}`, or "
+            "give the class scenarios"
+        )
+    return tuple(replace(scenario, type=name) for scenario in scenarios)
 
 
 def set_files() -> dict[str, Path]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import file_name
+from ssad.core.source import source_version
 from ssad.core.types import F64, U8, Episode
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 
@@ -150,8 +151,12 @@ class Perturbation:
         return file_name(f"{self.name}-{self.severity}")
 
     def version(self) -> str:
-        """Return a hash of what decides the result besides SSAD's source: weights, textures, a module of yours."""
-        return ""
+        """Return a hash of what decides the result besides SSAD's source: weights, textures, a module of yours.
+
+        By default 12 hex digits over the source of the module of its class; "" for a class of SSAD.
+        """
+        module = type(self).__module__
+        return "" if module.startswith("ssad.") else source_version(module)
 
     def applies_to(self, episode: Episode, town: LaneGraph) -> int | None:  # of the interface
         """Return the agent of an episode that the perturbation is on; None: it has none, and is left out.

@@ -52,7 +52,7 @@ class ContactPolicy(IntEnum):
 
 
 class TurnRank(IntEnum):
-    """Turn of a route at a junction, in the order of priority."""
+    """Turn of a route at a junction, in the order of priority. RIGHT is to the near side, left in left-hand traffic."""
 
     STRAIGHT = 0
     RIGHT = 1
@@ -101,7 +101,7 @@ class Roads:
     lane_junction: wp.array(dtype=wp.int32)  # [L] 1 inside a junction
     cell_first: wp.array(dtype=wp.int32)
     cell_segment: wp.array(dtype=wp.int32)
-    grid: wp.array(dtype=wp.vec4)  # [towns] origin x, origin y, cells a metre, unused
+    grid: wp.array(dtype=wp.vec4)  # [towns] origin x, origin y, cells a metre, 1 if turns on red are allowed
     grid_size: wp.array(dtype=wp.vec3i)  # [towns] nx, ny, first entry in cell_first
     signal_first: wp.array(dtype=wp.int32)  # [towns]
     signal_program: wp.array(dtype=wp.vec4)  # [S] cycle s, green from, green for, yellow for; cycle 0: off

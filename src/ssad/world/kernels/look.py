@@ -13,7 +13,7 @@ GOAL_RADIUS = wp.constant(2.0)  # m
 
 
 @wp.func
-def put(
+def put_row(
     out: wp.array2d(dtype=wp.float32),
     n: int,
     at: int,
@@ -47,7 +47,7 @@ def put_agent(
 ):
     """Write the row of agent j in the observer's frame: x, y, length, width, relative yaw, speed; zeros for j < 0."""
     if j < 0:
-        put(out, n, at, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        put_row(out, n, at, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return
     other_pose = state.pose[b, j]
     c = wp.cos(pose[2])
@@ -56,7 +56,7 @@ def put_agent(
     dy = other_pose[1] - pose[1]
     body = bank.body[bank.model[e, j]]
     turn = wrap(other_pose[2] - pose[2])
-    put(out, n, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j])
+    put_row(out, n, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j])
 
 
 @wp.kernel(enable_backward=False)
@@ -111,14 +111,14 @@ def look(
                     second_distance2 = distance2
     out[n, 2] = state.speed[b, i]
     out[n, 3] = hazard
-    put(out, n, 4, 0.0, 0.0, 2.0 * body[0], 2.0 * body[1], 0.0, state.speed[b, i])
+    put_row(out, n, 4, 0.0, 0.0, 2.0 * body[0], 2.0 * body[1], 0.0, state.speed[b, i])
     put_agent(bank, state, out, b, e, first, n, 10, pose)
     put_agent(bank, state, out, b, e, second, n, 16, pose)
     route = bank.route[e, i]
     if route[1] < 2:  # without a route: straight on
         out[n, 0] = 0.0
         out[n, 1] = 0.0
-        put(out, n, 22, 7.5, 0.0, 11.0, 2.0 * body[1], 0.0, 7.5)
+        put_row(out, n, 22, 7.5, 0.0, 11.0, 2.0 * body[1], 0.0, 7.5)
         return
     at = state.progress[b, i]
     last = route[1] - 1
@@ -154,7 +154,7 @@ def look(
         + (chord_end[1] - chord_start[1]) * (chord_end[1] - chord_start[1])
     )
     turn = wrap(wp.atan2(chord_end[1] - chord_start[1], chord_end[0] - chord_start[0]) - pose[2])
-    put(
+    put_row(
         out,
         n,
         22,
@@ -210,7 +210,9 @@ def look_as_adversary(
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     goal_distance = wp.sqrt(dx * dx + dy * dy)
-    put(out, n, 18, c * dx + s * dy, -s * dx + c * dy, GOAL_RADIUS, GOAL_RADIUS, wrap(goal[2] - pose[2]), goal_distance)
+    put_row(
+        out, n, 18, c * dx + s * dy, -s * dx + c * dy, GOAL_RADIUS, GOAL_RADIUS, wrap(goal[2] - pose[2]), goal_distance
+    )
 
 
 @wp.kernel(enable_backward=False)

@@ -183,7 +183,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     ego.route_distance[b] = wp.sqrt(min_distance2)
     ego.route_point[b] = nearest_point
 
-    # red light: the tail crosses the stop line on red; a right turn after a stop is allowed
+    # red light: the tail crosses the stop line on red; a town may allow a turn to the near side after a stop
     point = row(roads.path, route[0] + nearest_point)
     cosine = wp.cos(point[2])
     sine = wp.sin(point[2])
@@ -194,7 +194,8 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
         rule = row(roads.rule, route[0] + tail_point)
         index = roads.path_signal[route[0] + tail_point]
         if index >= 0 and rule[1] <= wp.max(step_length, 0.0) + 0.5 and rule[1] > -0.5:
-            stopped_right = int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT and state.waited[b, 0] >= 1.0
+            may_turn = int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT and roads.grid[bank.town[e]][3] > 0.0
+            stopped_right = may_turn and state.waited[b, 0] >= 1.0
             if signal_state(bank, roads, e, index, time) == SignalState.RED and not stopped_right:
                 ran_red = 1
     # rule[1] is whole metres: count a line once

@@ -422,8 +422,9 @@ def scan_agents(
                 signal_now == SignalState.RED
                 and int(road_rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
                 and state.waited[b, i] >= 1.0
+                and roads.grid[bank.town[e]][3] > 0.0
             ):
-                stop = False  # right turn on red, after a stop; it yields below
+                stop = False  # turn to the near side on red, after a stop, where allowed; it yields below
             if stop:
                 react = wp.min(react, idm_gap(speed, 0.0, line_gap + 1.0))
     state.react[b, i] = react

@@ -1,39 +1,38 @@
-"""Conversion of OpenDRIVE to lane graphs.
-
-The XML defines the links of lanes; carla.Map, in a process of its own, gives their geometry.
-"""
+"""Conversion of OpenDRIVE to lane graphs."""
 
 from __future__ import annotations
 
-import importlib.util
-import subprocess
-import sys
-import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from ssad.core.errors import MapError, install_extra
+from ssad.core.errors import MapError
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
+from ssad.world.roads.import_page import import_page, import_page_path
+from ssad.world.roads.lane_links import Key, LaneLinks
+from ssad.world.roads.lane_sampling import LaneSampler, LaneSamples
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
-from ssad.world.roads.xodr import MAX_BYTES, Connection, Lane, Link, MapRoad, Network, read_network
+from ssad.world.roads.thinning import thin
+from ssad.world.roads.xodr import MAX_BYTES, Lane, Network, local_coordinates, read_network
 
-TIMEOUT = 120.0  # s; Town05 takes about 3
-STEP = 2.0  # m, most between two points of a lane
-BEND = 0.01  # m, most that a chord leaves the curve
 NARROW = 0.05  # m; a lane that never gets wider is not there
 SHORT = 0.1  # m; shorter pieces of lane are passed over
 JOIN = 1.0  # m, most between the end of a lane and the start of its successor
+JOIN_MARGIN = 0.1  # m beyond half the width of a lane across which one that would end is joined
+WIDE = 100.0  # m; a wider lane is a mistake
+BESIDE = 0.5  # m between the end of a lane and an unlinked start that is worth a word
+SAME_WAY = 0.7  # cosine between two lanes of the same direction
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
 
-Key = tuple[int, int, int]  # road, section, lane id
-Answer = dict[str, npt.NDArray[Any]]
+Progress = Callable[[str], None]
 
 
 @dataclass
@@ -47,154 +46,161 @@ class _Shape:
     s: F64
 
 
-def bake(xodr: Path, name: str | None = None) -> LaneGraph:
+def bake(
+    xodr: Path, name: str | None = None, *, report: ImportReport | None = None, progress: Progress | None = None
+) -> LaneGraph:
     """Return the lane graph of an OpenDRIVE file.
 
     Args:
         xodr: The file.
         name: Name of the town; None: that of the file.
+        report: Filled with what came in, what was left out, and what is doubtful.
+        progress: Called with the name of each stage when it begins.
 
     Raises:
-        MapError: The file is invalid, or carla is not installed.
+        MapError: The file is invalid.
     """
     path = Path(xodr)
-    network = read_network(path)
+    account = ImportReport(str(path)) if report is None else report
+    stage = progress or (lambda text: None)
+    stage("reading the file")
+    network = read_network(path, account)
     keys = [
         (road.id, index, lane)
         for road in network.roads.values()
         for index, section in enumerate(road.sections)
         for lane in sorted(section.lanes)
     ]
-    answer = _sample(path, network, keys)
-    shapes: dict[Key, _Shape] = {}
-    ends = np.cumsum(answer["count"])
-    for key, end, count in zip(keys, ends.tolist(), answer["count"].tolist(), strict=True):
-        shape = _shape(answer, slice(end - count, end), reverse=key[2] > 0)
-        if shape is not None:
-            shapes[key] = shape
+    stage(f"evaluating {len(keys)} lanes of {len(network.roads)} roads")
+    sampler = LaneSampler(network)
+    sampler.check(account)
+    shapes = _shapes(network, keys, sampler.lanes(keys), account)
     if not any(_lane(network, key).kind == LaneType.DRIVING for key in shapes):
-        raise MapError(f"{path}: carla.Map finds no drivable lane in it; correct the map and import it again")
-    return _assemble(name or path.stem, network, shapes, answer)
+        raise MapError(f"{path}: no drivable lane in it has an area; correct the map and import it again")
+    stage("linking lanes, placing signals")
+    return _assemble(name or path.stem, network, shapes, sampler, account)
 
 
-def import_map(path: Path, name: str | None, home: Path) -> Path:
-    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically; a copy of the file is stored beside it.
+def import_map(
+    path: Path,
+    name: str | None,
+    home: Path,
+    *,
+    report: ImportReport | None = None,
+    strict: bool = False,
+    turn_on_red: bool | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically.
+
+    A copy of the file is stored beside it, with the coordinates of the town. A page with the report and a picture from
+    above is written to HOME/imports/NAME.html.
 
     Args:
         path: The file; a town that is baked already (.npz) is copied.
         name: Name of the town; None: that of the file.
         home: Parent of the towns' folder.
+        report: Filled with what came in, what was left out, and what is doubtful.
+        strict: Refuse a file with doubts.
+        turn_on_red: Turns to the near side are allowed on red; None: as the file suggests.
+        progress: Called with the name of each stage when it begins.
 
     Returns:
         Path of the lane graph.
 
     Raises:
-        MapError: See `bake`.
+        MapError: See `bake`; or the file is doubtful, if `strict`.
     """
     town_name = name or Path(path).stem
     if not town_name or town_name.startswith(".") or set(town_name) & set('/\\:*?"<>|\0'):
         raise MapError(f"'{town_name}' cannot be the name of a town; use letters, digits, _ and -")
     target = Path(home) / "towns" / f"{town_name}.npz"
-    baked = Path(path).suffix == ".npz"
-    graph = replace(load_graph(path), name=town_name) if baked else bake(path, town_name)
+    account = ImportReport(str(path)) if report is None else report
+    is_baked = Path(path).suffix == ".npz"
+    graph = (
+        replace(load_graph(path), name=town_name)
+        if is_baked
+        else bake(path, town_name, report=account, progress=progress)
+    )
+    if strict:
+        account.refuse_doubts(MapError)
+    if turn_on_red is not None:
+        graph = replace(graph, turn_on_red=np.array([turn_on_red]))
     source = Path(path).with_suffix(".xodr")
     xodr_bytes = read_bytes(source, limit=MAX_BYTES) if source.is_file() else None
     save_graph(graph, target)
     if xodr_bytes is not None:
-        write_atomic(target.with_suffix(".xodr"), xodr_bytes)
+        write_atomic(target.with_suffix(".xodr"), xodr_bytes if is_baked else local_coordinates(xodr_bytes))
     else:
         target.with_suffix(".xodr").unlink(missing_ok=True)  # remove the source of an earlier map of this name
+    write_atomic(import_page_path(home, town_name), import_page(graph, account))
     return target
 
 
-def _sample(path: Path, network: Network, keys: list[Key]) -> Answer:
-    """Sample the lanes with carla.Map in a process of its own."""
-    if importlib.util.find_spec("carla") is None:
-        raise MapError(f"{path}: reading OpenDRIVE needs the package carla; {install_extra('carla')}")
-    sections = [network.roads[road].sections[section_index] for road, section_index, _ in keys]
-    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
-        request, answer = Path(folder) / "request.npz", Path(folder) / "answer.npz"
-        np.savez(
-            request,
-            road=np.array([key[0] for key in keys]),
-            lane=np.array([key[2] for key in keys]),
-            s0=np.array([section.s0 for section in sections]),
-            s1=np.array([section.s1 for section in sections]),
-        )
-        reader_command = [sys.executable, "-m", "ssad.world.roads._carla_reader", str(path), str(request), str(answer)]
-        try:
-            process = subprocess.run(
-                reader_command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False
-            )
-        except subprocess.TimeoutExpired:
-            raise MapError(f"{path}: carla.Map did not read it in {TIMEOUT:.0f} s; make it smaller") from None
-        if process.returncode != 0 or not answer.exists():
-            lines = [line for line in process.stderr.strip().splitlines() if not line.startswith("WARNING")]
-            message = (lines or ["no message"])[-1][:200]
-            reason = f"signal {-process.returncode}" if process.returncode < 0 else f"code {process.returncode}"
-            raise MapError(f"{path}: carla.Map cannot read it and stopped ({reason}: {message}); correct the map")
-        with np.load(answer, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-
-
-def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
-    """Samples of a lane in driving order with the superfluous ones left out; None if there is no lane."""
-    step = -1 if reverse else 1
-    column = dict(zip(("x", "y", "z", "yaw", "width"), answer["table"][part][::step, 1:].T, strict=True))
-    if (
-        len(column["x"]) < 2
-        or column["width"].max() < NARROW
-        or not all(np.isfinite(values).all() for values in column.values())
-    ):
-        return None
-    xy = np.stack([column["x"], column["y"]], axis=1)
-    shifted_xy = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-3])
-    if shifted_xy.sum() < 2:
-        return None
-    xy, z, yaw, width = (
-        xy[shifted_xy],
-        column["z"][shifted_xy],
-        np.unwrap(column["yaw"][shifted_xy]),
-        column["width"][shifted_xy],
-    )
-    arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-    if arc_length[-1] < SHORT:
-        return None
-    # On unwrapped yaw, which has no jump at pi.
-    selected = _thin(arc_length, yaw, width)
+def _shapes(network: Network, keys: list[Key], samples: LaneSamples, report: ImportReport) -> dict[Key, _Shape]:
+    """Return the shapes of the lanes that have an area, with the superfluous samples left out."""
+    first, lane_count = samples.first, len(keys)
+    lane = np.repeat(np.arange(lane_count), np.diff(first))
+    spacing = np.hypot(*np.diff(samples.xy, axis=0, prepend=samples.xy[:1]).T)
+    is_start = np.zeros(len(lane), bool)
+    is_start[first[:-1][np.diff(first) > 0]] = True
+    distinct = is_start | (spacing > 1e-3)
+    rows = np.flatnonzero(distinct)
+    lane = lane[rows]
+    first = np.searchsorted(lane, np.arange(lane_count + 1))
+    xy, z, yaw, width = samples.xy[rows], samples.z[rows], samples.yaw[rows], samples.width[rows]
+    tangent = samples.tangent[rows]
+    spacing = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
+    is_start = is_start[rows]
+    spacing[is_start] = 0.0
+    # Arc length from the start of each lane, and direction without jumps along it.
+    total = np.cumsum(spacing)
+    arc_length = total - total[first[:-1][lane]] if len(lane) else total
+    turn = np.diff(tangent, prepend=tangent[:1])
+    turn[is_start] = 0.0
+    smooth_tangent = np.cumsum(np.asarray(wrap_angle(turn), np.float64))
+    counts = np.diff(first)
+    widest = np.zeros(lane_count)
+    np.maximum.at(widest, lane, width)
+    lengths = np.zeros(lane_count)
+    lengths[counts > 0] = arc_length[first[1:][counts > 0] - 1]
+    is_finite = np.ones(lane_count, bool)
+    is_finite[lane[~(np.isfinite(xy).all(1) & np.isfinite(z) & (width <= WIDE))]] = False
+    is_present = is_finite & (widest >= NARROW) & (counts >= 2) & (lengths >= SHORT)
     wrapped_yaw = np.asarray(wrap_angle(yaw), np.float64)
-    return _Shape(
-        xy[selected], z[selected], wrapped_yaw[selected], np.maximum(width[selected], 0.0), arc_length[selected]
-    )
+    shapes: dict[Key, _Shape] = {}
+    selected = thin(first, arc_length, smooth_tangent, width)
+    for index in np.flatnonzero(is_present).tolist():
+        part = selected[index]
+        shapes[keys[index]] = _Shape(xy[part], z[part], wrapped_yaw[part], width[part], arc_length[part])
+    for index in np.flatnonzero(~is_present).tolist():
+        kind = _lane(network, keys[index]).kind
+        if not is_finite[index]:
+            report.doubt(f"a lane is wider than {WIDE:g} m or has no finite shape; it is left out", _place(keys[index]))
+        elif kind != LaneType.NONE:
+            limit = f"narrower than {NARROW:g} m" if widest[index] < NARROW else f"shorter than {SHORT:g} m"
+            report.note(f"{kind.name.lower()} lanes {limit} are passed over", _place(keys[index]))
+    for index in np.flatnonzero(samples.folded).tolist():
+        if _lane(network, keys[index]).kind == LaneType.DRIVING:
+            report.doubt("a drivable lane runs backwards, inside the centre of its curve", _place(keys[index]))
+    return shapes
 
 
-def _thin(s: F64, yaw: F64, width: F64) -> list[int]:
-    """Return the fewest samples (greedy) with chords up to STEP that deviate from curve and width by at most BEND."""
-    selected = [0]
-    start, count = 0, len(s)
-    while start < count - 1:
-        end = start + 1
-        while end + 1 < count and s[end + 1] - s[start] <= STEP + 1e-6:
-            chord = s[end + 1] - s[start]
-            heading_change = np.ptp(yaw[start : end + 2])
-            linear_width = width[start] + (width[end + 1] - width[start]) * (s[start : end + 2] - s[start]) / chord
-            # The sagitta of an arc is chord times turn over 8.
-            if chord * heading_change / 8.0 > BEND or np.abs(width[start : end + 2] - linear_width).max() > 2.0 * BEND:
-                break
-            end += 1
-        selected.append(end)
-        start = end
-    return selected
+def _place(key: Key) -> str:
+    return f"road {key[0]}, section {key[1]}, lane {key[2]}"
 
 
 def _lane(network: Network, key: Key) -> Lane:
     return network.roads[key[0]].sections[key[1]].lanes[key[2]]
 
 
-def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: Answer) -> LaneGraph:
+def _assemble(
+    name: str, network: Network, shapes: dict[Key, _Shape], sampler: LaneSampler, report: ImportReport
+) -> LaneGraph:
     keys = list(shapes)
     index = {key: row for row, key in enumerate(keys)}
-    successors = [_following_lanes(network, key, shapes) for key in keys]
+    lane_links = LaneLinks(network, sampler.road_ends(), report)
+    successors = [_following_lanes(lane_links, key, shapes, report) for key in keys]
     links = [sorted({index[successor] for successor in targets if successor in index}) for targets in successors]
     lane_entries = [_lane(network, key) for key in keys]
     junctions = [network.roads[key[0]].junction for key in keys]
@@ -204,8 +210,8 @@ def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: An
     shape_list = list(shapes.values())
     point_counts = [len(shape.s) for shape in shape_list]
     offset = np.concatenate([[0], np.cumsum(point_counts)])
-    crosswalk_corners = answer["crosswalk"]
-    corner_count = np.bincount(crosswalk_corners[:, 0].astype(int)) if len(crosswalk_corners) else np.zeros(0, int)
+    crosswalks = sampler.crosswalks()
+    signal_poses = sampler.places(list(network.signal_places.values()))
     approaches = Approaches(
         network=network,
         keys=keys,
@@ -216,10 +222,13 @@ def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: An
         begin=np.array([[*shape.xy[0], shape.yaw[0]] for shape in shape_list]),
         width=np.array([shape.width[-1] for shape in shape_list]),
         line=[(shape.xy, shape.s) for shape in shape_list],
-        crosswalks=[crosswalk_corners[crosswalk_corners[:, 0] == row, 1:] for row in range(len(corner_count))],
-        lights=dict(zip(answer["light_id"].tolist(), answer["light"].tolist(), strict=True)),
+        crosswalks=crosswalks,
+        lights=dict(zip(network.signal_places, signal_poses.tolist(), strict=True)),
+        forward=np.array([lane.forward for lane in lane_entries]),
+        left_hand=network.left_hand,
+        stop_lines=sampler.places([line for road in network.roads.values() for line in road.stop_lines])[:, :2],
     )
-    return LaneGraph(
+    graph = LaneGraph(
         name=name,
         xy=np.concatenate([shape.xy for shape in shape_list]),
         z=np.concatenate([shape.z for shape in shape_list]),
@@ -239,11 +248,51 @@ def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: An
         right_marking=np.array([sides[1] for sides in markings]),
         succ_offset=np.concatenate([[0], np.cumsum([len(targets) for targets in links])]),
         succ=_ints(lane for targets in links for lane in targets),
-        crosswalk_offset=np.concatenate([[0], np.cumsum(corner_count)]),
-        crosswalk_xy=crosswalk_corners[:, 1:],
+        crosswalk_offset=np.concatenate([[0], np.cumsum([len(corners) for corners in crosswalks])]),
+        crosswalk_xy=np.concatenate([np.zeros((0, 2)), *crosswalks]),
         **place_signals(approaches),
         **place_signs(approaches),
+        forward=approaches.forward,
+        origin=np.array(network.origin),
+        left_hand=np.array([network.left_hand]),
+        turn_on_red=np.array([network.turn_on_red]),
     )
+    _describe(graph, network, report)
+    return graph
+
+
+def _describe(graph: LaneGraph, network: Network, report: ImportReport) -> None:
+    """Add to a report what the graph holds, and the lanes that end beside an unlinked start."""
+    driving = graph.kind == LaneType.DRIVING
+    others = [
+        f"{count} {kind.name.lower()}"
+        for kind in LaneType
+        if kind not in (LaneType.DRIVING, LaneType.NONE) and (count := int((graph.kind == kind).sum()))
+    ]
+    kilometres = float(graph.length[driving].sum()) / 1000.0
+    report.contents += [
+        f"{len(network.roads)} roads, {len(network.junctions)} junctions",
+        f"{int(driving.sum())} drivable lanes of {kilometres:.2f} km{', ' if others else ''}{', '.join(others)}",
+        f"{int((~graph.signal_virtual).sum())} traffic lights, {len(graph.sign_kind)} signs,"
+        f" {len(graph.crosswalk_offset) - 1} crosswalks",
+    ]
+    lanes = np.flatnonzero(driving)
+    starts = lanes[np.diff(graph.pred_offset)[lanes] == 0]
+    if not len(starts):
+        return
+    start_points, end_points = graph.offset[:-1], graph.offset[1:] - 1
+    beside = cKDTree(graph.xy[start_points[starts]]).query_ball_point(graph.xy[end_points[lanes]], BESIDE)
+    for lane, rows in zip(lanes.tolist(), beside, strict=True):
+        for start in starts[rows].tolist():
+            turn = float(graph.yaw[start_points[start]] - graph.yaw[end_points[lane]])
+            if np.cos(turn) > SAME_WAY and start != lane:
+                report.doubt(
+                    "a lane ends beside an unlinked start", f"{_name(graph, lane)} beside {_name(graph, start)}"
+                )
+
+
+def _name(graph: LaneGraph, lane: int) -> str:
+    return _place((int(graph.road[lane]), int(graph.section[lane]), int(graph.lane_id[lane])))
 
 
 def _ints(values: Any) -> I32:
@@ -253,66 +302,51 @@ def _ints(values: Any) -> I32:
 def _sides(network: Network, key: Key) -> tuple[Key, Key]:
     """Return the keys of the lanes to the left and right in driving direction, existing or not."""
     road, section, lane = key
-    sign = 1 if lane > 0 else -1
-    # Lane 0 is the centre line: inside lane 1 lies lane -1.
-    inner = lane - sign or -sign
-    return (road, section, inner), (road, section, lane + sign)
+    # Lane 0 is the centre line: inside lane 1 lies lane -1. Ids grow to the left of the road's direction.
+    higher, lower = (road, section, lane + 1 or 1), (road, section, lane - 1 or -1)
+    return (higher, lower) if _lane(network, key).forward else (lower, higher)
 
 
 def _paint(network: Network, key: Key) -> tuple[Marking, Marking]:
     """Return the markings to the left and right of a lane in driving direction."""
     section = network.roads[key[0]].sections[key[1]]
+    lane = section.lanes[key[2]]
     inner = key[2] - (1 if key[2] > 0 else -1)
-    if inner == 0:
-        return section.centre_mark, section.lanes[key[2]].mark
-    left = section.lanes[inner].mark if inner in section.lanes else Marking.NONE
-    return left, section.lanes[key[2]].mark
+    inner_mark = section.lanes[inner].mark if inner in section.lanes else Marking.NONE
+    marks = (section.centre_mark if inner == 0 else inner_mark, lane.mark)
+    # The centre lies to the left of traffic that keeps to the right.
+    return marks if lane.forward == (key[2] < 0) else marks[::-1]
 
 
-def _following_lanes(network: Network, key: Key, shapes: dict[Key, _Shape]) -> list[Key]:
-    """Return the lanes that begin where a lane ends, passing through lanes without area (sections of no length)."""
-    successors, queue, visited = [], [key], {key}
+def _following_lanes(links: LaneLinks, key: Key, shapes: dict[Key, _Shape], report: ImportReport) -> list[Key]:
+    """Return the lanes that begin where a lane ends, passing through lanes without area (sections of no length).
+
+    A lane that would end otherwise goes on across a step of up to half a lane, as where it splits in two.
+    """
+    gaps: list[tuple[float, Key]] = []
+    queue, visited = [key], {key}
     while queue:
-        for candidate in _linked_lanes(network, queue.pop()):
-            if candidate in visited or candidate[2] not in network.roads[candidate[0]].sections[candidate[1]].lanes:
+        for candidate in links.following(queue.pop()):
+            if candidate in visited:
                 continue
             visited.add(candidate)
-            if candidate not in shapes:
+            if candidate in shapes:
+                gaps.append((float(np.hypot(*(shapes[candidate].xy[0] - shapes[key].xy[-1]))), candidate))
+            else:
                 queue.append(candidate)
-            elif np.hypot(*(shapes[candidate].xy[0] - shapes[key].xy[-1])) <= JOIN:
-                successors.append(candidate)
+    successors = [candidate for gap, candidate in gaps if gap <= JOIN]
+    is_driving = links.lane(key).kind == LaneType.DRIVING
+    for gap, candidate in gaps:
+        if gap <= JOIN or not is_driving or links.lane(candidate).kind != LaneType.DRIVING:
+            continue
+        place = f"{_place(key)} to {_place(candidate)}: {gap:.1f} m"
+        half_width = 0.5 * max(float(shapes[key].width[-1]), float(shapes[candidate].width[0]))
+        if not any(near <= JOIN for near, _ in gaps) and gap <= half_width + JOIN_MARGIN:
+            successors.append(candidate)
+            report.note("lanes are joined across a step aside", place)
+        else:
+            report.doubt(f"linked lanes whose ends are more than {JOIN:g} m apart are not joined", place)
     return successors
-
-
-def _linked_lanes(network: Network, key: Key) -> list[Key]:
-    """Return the lanes that the map links to the end of a lane, in its driving direction."""
-    road, index, lane_id = network.roads[key[0]], key[1], key[2]
-    forward = lane_id < 0
-    lane_entry = road.sections[index].lanes[lane_id]
-    target = lane_entry.successor if forward else lane_entry.predecessor
-    next_section = index + (1 if forward else -1)
-    if 0 <= next_section < len(road.sections):
-        return [] if target is None else [(road.id, next_section, target)]
-    road_link = road.successor if forward else road.predecessor
-    if road_link is None:
-        return []
-    if road_link.kind == "road":
-        return [] if target is None else [_lane_at_end(network.roads[road_link.id], road_link.contact, target)]
-    return [
-        _lane_at_end(network.roads[connection.connecting], connection.contact, target_lane)
-        for connection in _connections(network, road_link, road)
-        for source_lane, target_lane in connection.lanes
-        if source_lane == lane_id
-    ]
-
-
-def _connections(network: Network, link: Link, road: MapRoad) -> list[Connection]:
-    return [connection for connection in network.junctions[link.id] if connection.incoming == road.id]
-
-
-def _lane_at_end(road: MapRoad, contact: str, lane: int) -> Key:
-    """Return the key of a lane at one end of a road."""
-    return (road.id, len(road.sections) - 1 if contact == "end" else 0, lane)
 
 
 def _speeds(network: Network, keys: list[Key], lanes: list[Lane], links: list[list[int]]) -> F64:

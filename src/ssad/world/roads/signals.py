@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,29 @@ class Approaches:
     line: list[tuple[F64, F64]]  # xy [., 2], s [.]
     crosswalks: list[F64]
     lights: dict[str, list[float]]  # x, y, yaw of signals of any kind
+    forward: npt.NDArray[np.bool_]  # [L] traffic runs along the road
+    left_hand: bool  # traffic keeps to the left
+    stop_lines: F64  # [., 2] x, y of the middles of painted lines
+
+    @cached_property
+    def lanes_of_junction(self) -> dict[int, list[int]]:
+        """Lanes of each junction."""
+        lanes: dict[int, list[int]] = {}
+        for lane_index, junction in enumerate(self.junction.tolist()):
+            lanes.setdefault(junction, []).append(lane_index)
+        return lanes
+
+    @cached_property
+    def crosswalk_boxes(self) -> F64:
+        """Lowest and highest x and y of each crosswalk [C, 2, 2]."""
+        boxes = [(corners.min(axis=0), corners.max(axis=0)) for corners in self.crosswalks]
+        return np.array(boxes, np.float64).reshape(-1, 2, 2)
+
+    def post_beside(self, lane: int) -> tuple[float, float]:
+        """Return x and y of a post beside the end of an outermost lane."""
+        x, y, yaw = self.end[lane]
+        lateral = (0.5 * float(self.width[lane]) + 1.0) * (-1.0 if self.left_hand else 1.0)
+        return float(x + lateral * np.sin(yaw)), float(y - lateral * np.cos(yaw))
 
 
 @dataclass
@@ -58,7 +82,7 @@ def place_signals(data: Approaches) -> dict[str, Any]:
     stop_rows: list[tuple[int, int, float]] = []
     for junction, arms in _arms(data).items():
         approaches = [approach for approach in arms if approach.lanes]
-        junction_lanes = [lane_index for lane_index in range(len(data.keys)) if data.junction[lane_index] == junction]
+        junction_lanes = data.lanes_of_junction.get(junction, [])
         for approach in approaches:
             approach.light = _facing(data, approach, junction_lanes)
         has_lights = any(approach.light for approach in approaches)
@@ -73,8 +97,7 @@ def place_signals(data: Approaches) -> dict[str, Any]:
             if approach.light and approach.light in data.lights:
                 x, y = data.lights[approach.light][:2]
             else:
-                lateral = 0.5 * data.width[outer] + 1.0
-                x, y = x + lateral * np.sin(yaw), y - lateral * np.cos(yaw)
+                x, y = data.post_beside(outer)
             stop_rows += [(len(signal_rows), lane, _stop(data, lane)) for lane in approach.lanes]
             signal_rows.append((x, y, yaw, junction, phase, not has_lights))
     signal_table = np.array(signal_rows, np.float64).reshape(-1, 6)
@@ -104,7 +127,7 @@ def place_signs(data: Approaches) -> dict[str, Any]:
     signed_lanes: dict[str, set[int]] = {}
     for lane_index, (road, _, lane) in enumerate(data.keys):
         for placement in data.network.roads[road].signs:
-            in_direction = placement.way == 0 or placement.way * lane < 0
+            in_direction = placement.way == 0 or (placement.way > 0) == data.forward[lane_index]
             if placement.sign not in data.network.signs or not in_direction:
                 continue
             if placement.low == 0 == placement.high or placement.low <= lane <= placement.high:
@@ -122,8 +145,7 @@ def place_signs(data: Approaches) -> dict[str, Any]:
         if sign in data.lights:
             x, y = data.lights[sign][:2]
         else:
-            lateral = 0.5 * data.width[outer_lane] + 1.0
-            x, y = x + lateral * np.sin(yaw), y - lateral * np.cos(yaw)
+            x, y = data.post_beside(outer_lane)
         rule_rows += [(len(sign_rows), lane, _stop(data, lane)) for lane in lanes]
         sign_rows.append((x, y, yaw, int(data.network.signs[sign])))
     sign_table = np.array(sign_rows, np.float64).reshape(-1, 4)
@@ -147,7 +169,7 @@ def _lanes_of_approach(data: Approaches, sign: str, sign_lanes: set[int]) -> lis
             for successor in data.links[lane_index]
         )
         if data.kind[lane_index] == LaneType.DRIVING and data.junction[lane_index] < 0 and leads_in:
-            approaches.setdefault((data.keys[lane_index][0], data.keys[lane_index][2] < 0), []).append(lane_index)
+            approaches.setdefault((data.keys[lane_index][0], bool(data.forward[lane_index])), []).append(lane_index)
     if len(approaches) < 2 or sign not in data.lights:
         return next(iter(approaches.values()), [])
     x, y = data.lights[sign][:2]
@@ -163,7 +185,7 @@ def _arms(data: Approaches) -> dict[int, list[_Approach]]:
     for lane_index, successors in enumerate(data.links):
         if data.kind[lane_index] != LaneType.DRIVING:
             continue
-        road, _, lane = data.keys[lane_index]
+        road = data.keys[lane_index][0]
         for successor in successors:
             if data.kind[successor] != LaneType.DRIVING:
                 continue
@@ -172,14 +194,14 @@ def _arms(data: Approaches) -> dict[int, list[_Approach]]:
                 continue
             if next_junction >= 0:
                 approach = arms_by_junction.setdefault(next_junction, {}).setdefault(
-                    (road, lane < 0), _Approach(next_junction, [])
+                    (road, bool(data.forward[lane_index])), _Approach(next_junction, [])
                 )
                 if lane_index not in approach.lanes:
                     approach.lanes.append(lane_index)
             if own_junction >= 0:
-                exit_road, _, exit_lane = data.keys[successor]
+                exit_road = data.keys[successor][0]
                 arms_by_junction.setdefault(own_junction, {}).setdefault(
-                    (exit_road, exit_lane > 0), _Approach(own_junction, [])
+                    (exit_road, not data.forward[successor]), _Approach(own_junction, [])
                 )
     return {
         junction: [successors[key] for key in sorted(successors)]
@@ -263,15 +285,25 @@ def _cross(data: Approaches, first: _Approach, second: _Approach) -> bool:
 
 
 def _stop(data: Approaches, lane: int) -> float:
-    """Arc length of the stop line: the end of the lane, or before a crosswalk on its last metres."""
+    """Arc length of the stop line: the end of the lane, or before a crosswalk or a painted line on its last metres."""
     xy, arc_length = data.line[lane]
     positions = np.arange(max(0.0, arc_length[-1] - _TAIL), arc_length[-1], 0.25)
     points = np.stack([np.interp(positions, arc_length, xy[:, axis]) for axis in range(2)], axis=1)
     stop = float(arc_length[-1])
-    for crosswalk in data.crosswalks:
+    boxes = data.crosswalk_boxes
+    near = ((boxes[:, 1] >= points.min(axis=0)) & (boxes[:, 0] <= points.max(axis=0))).all(axis=1)
+    for row in np.flatnonzero(near).tolist():
+        crosswalk = data.crosswalks[row]
         on_crosswalk = in_polygon(points, crosswalk)
         if on_crosswalk.any():
             stop = min(stop, float(positions[on_crosswalk][0]) - SETBACK)
+    if len(data.stop_lines):
+        offsets = data.stop_lines - xy[-1]
+        for line in data.stop_lines[np.hypot(*offsets.T) < _TAIL]:
+            distances = np.hypot(*(points - line).T)
+            nearest = int(distances.argmin())
+            if nearest > 0 and distances[nearest] <= data.width[lane] + 0.25:
+                stop = min(stop, float(positions[nearest]))
     return max(stop, 0.0)
 
 

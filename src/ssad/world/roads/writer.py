@@ -68,25 +68,25 @@ def write_town(town: Town) -> str:
     for junction in plain_junctions:
         if junction.place in ramps_by_place:
             entry_ramp, exit_ramp = (by_place[ramp_place] for ramp_place in ramps_by_place[junction.place])
-            _interchange(roads, root, junction, (entry_ramp, exit_ramp))
+            _write_interchange(roads, root, junction, (entry_ramp, exit_ramp))
         else:
-            _connect(roads, root, junction)
+            _write_connecting_roads(roads, root, junction)
     signalled_places = set(town.signalled)
     stem_count = 0
     for junction in plain_junctions:
         if junction.place in signalled_places:
-            _signals(root, roads, junction, lengths)
+            _write_signals(root, roads, junction, lengths)
             continue
         if junction.place in ramps_by_place:
             continue
         signed_arms = _signed_arms(junction)
         stem_count += len(signed_arms) == 1
-        _signs(roads, junction, signed_arms, lengths, stop=len(signed_arms) > 1 or stem_count % YIELDS > 0)
+        _write_signs(roads, junction, signed_arms, lengths, stop=len(signed_arms) > 1 or stem_count % YIELDS > 0)
     for roundabout in town.roundabouts:
         entries = [junction for junction in junctions if junction.place == roundabout.place]
-        _ring(roads, root, roundabout, entries)
+        _write_ring(roads, root, roundabout, entries)
         for junction in entries:
-            _signs(roads, junction, junction.arms, lengths, stop=False)
+            _write_signs(roads, junction, junction.arms, lengths, stop=False)
     tag_order = {"header": 0, "controller": 2, "junction": 3}  # as the format asks for it, between them the roads
     # `sorted` is stable, so roads and junctions keep the order in which they were made.
     root[:] = sorted([*root, *roads], key=lambda element: tag_order.get(element.tag, 1))
@@ -179,7 +179,7 @@ def _crosswalk(objects: Element, number: int, index: int, arc_length: float, str
         SubElement(outline, "cornerLocal", u=decimal(corner_u), v=decimal(corner_v), z="0", height="0")
 
 
-def _connect(roads: list[Element], root: Element, junction: Junction) -> None:
+def _write_connecting_roads(roads: list[Element], root: Element, junction: Junction) -> None:
     """Write the connecting roads of every movement through a junction."""
     element = SubElement(root, "junction", id=str(junction.id), name=f"junction {junction.id}")
     number = junction.id
@@ -190,11 +190,13 @@ def _connect(roads: list[Element], root: Element, junction: Junction) -> None:
             turn_angle = wrap(end_arm.heading - start_arm.heading - math.pi)
             for lane_pairs in _movements(junction, start_arm, end_arm, turn_angle):
                 number += 1
-                road = _way(number, (junction, junction), (start_arm, end_arm), pairs=lane_pairs)
-                _add_way(roads, element, road, start_arm, lane_pairs)
+                road = _connecting_road(number, (junction, junction), (start_arm, end_arm), pairs=lane_pairs)
+                _add_connecting_road(roads, element, road, start_arm, lane_pairs)
 
 
-def _add_way(roads: list[Element], element: Element, road: Element, start: Arm, pairs: list[tuple[int, int]]) -> None:
+def _add_connecting_road(
+    roads: list[Element], element: Element, road: Element, start: Arm, pairs: list[tuple[int, int]]
+) -> None:
     """Enter a connecting road into the list of roads and into its junction."""
     roads.append(road)
     number = road.get("id", "")
@@ -205,7 +207,9 @@ def _add_way(roads: list[Element], element: Element, road: Element, start: Arm, 
         SubElement(connection, "laneLink", {"from": str(start.inward(incoming_lane)), "to": str(-index - 1)})
 
 
-def _interchange(roads: list[Element], root: Element, junction: Junction, ramps: tuple[Junction, Junction]) -> None:
+def _write_interchange(
+    roads: list[Element], root: Element, junction: Junction, ramps: tuple[Junction, Junction]
+) -> None:
     """Ways through an interchange: straight on, from the ramp `on` to the wider part, from there to the ramp `off`."""
     element = SubElement(root, "junction", id=str(junction.id), name=f"junction {junction.id}")
     narrow_arm, wide_arm = sorted(junction.arms, key=lambda arm: arm.street.lanes)
@@ -220,16 +224,16 @@ def _interchange(roads: list[Element], root: Element, junction: Junction, ramps:
             ((junction, exit_ramp), (wide_arm, exit_ramp.arms[0]), [(outermost, 1)]),
         )
     ):
-        _add_way(
+        _add_connecting_road(
             roads,
             element,
-            _way(junction.id + 1 + lane, place_pair, arm_pair, pairs=lane_pairs),
+            _connecting_road(junction.id + 1 + lane, place_pair, arm_pair, pairs=lane_pairs),
             arm_pair[0],
             lane_pairs,
         )
 
 
-def _ring(roads: list[Element], root: Element, ring: Roundabout, entries: list[Junction]) -> None:
+def _write_ring(roads: list[Element], root: Element, ring: Roundabout, entries: list[Junction]) -> None:
     """The roads of a ring between its arms, and at each arm the ways on, in and out."""
     entries = sorted(entries, key=lambda junction: wrap(junction.arms[0].heading))
     street = entries[0].arms[0].street
@@ -256,9 +260,9 @@ def _ring(roads: list[Element], root: Element, ring: Roundabout, entries: list[J
             (ring_in, arm, turn_pieces(island_points[0], low_angle + 0.5 * math.pi, arm_end, -turn_angle)),
         )
         for index, (start_arm, target, pieces) in enumerate(movements, start=1):
-            road = _way_road(junction.id + index, junction.id, (start_arm, target), pieces)
+            road = _empty_connecting_road(junction.id + index, junction.id, (start_arm, target), pieces)
             fill_way(road, start_arm, target, [(1, 1)], kerb=index > 1, eased=True)
-            _add_way(roads, element, road, start_arm, [(1, 1)])
+            _add_connecting_road(roads, element, road, start_arm, [(1, 1)])
 
 
 def _arc(ring: Roundabout, angle: float, turn: float) -> Piece:
@@ -284,16 +288,16 @@ def _movements(junction: Junction, start: Arm, end: Arm, turn: float) -> list[li
     )
 
 
-def _way(
+def _connecting_road(
     number: int, places: tuple[Junction, Junction], arms: tuple[Arm, Arm], *, pairs: list[tuple[int, int]]
 ) -> Element:
     """Write a connecting road; its reference line runs on the left edge of its leftmost lane."""
     start_arm, end_arm = arms
     turn_angle = wrap(end_arm.heading - start_arm.heading - math.pi)
     heading = start_arm.heading + math.pi
-    start_point = _edge(places[0], start_arm, -start_arm.offset(pairs[0][0]), inward=True)
-    end_point = _edge(places[1], end_arm, -end_arm.offset(pairs[0][1]), inward=False)
-    road = _way_road(number, places[0].id, arms, turn_pieces(start_point, heading, end_point, turn_angle))
+    start_point = _arm_edge_point(places[0], start_arm, -start_arm.offset(pairs[0][0]), inward=True)
+    end_point = _arm_edge_point(places[1], end_arm, -end_arm.offset(pairs[0][1]), inward=False)
+    road = _empty_connecting_road(number, places[0].id, arms, turn_pieces(start_point, heading, end_point, turn_angle))
     # a kerb lies to the right of a right turn, and of a way straight on where no arm leaves to the right
     right_heading = wrap(heading - math.pi / 2.0)
     open_right = any(abs(wrap(arm.heading - right_heading)) < 0.1 for arm in places[0].arms)
@@ -303,7 +307,7 @@ def _way(
     return road
 
 
-def _way_road(number: int, junction: int, arms: tuple[Arm, Arm], pieces: list[Piece]) -> Element:
+def _empty_connecting_road(number: int, junction: int, arms: tuple[Arm, Arm], pieces: list[Piece]) -> Element:
     """Write a connecting road without lanes."""
     road = road_element(f"way {number}", number, junction, pieces)
     for name, arm in zip(("predecessor", "successor"), arms, strict=True):
@@ -312,7 +316,7 @@ def _way_road(number: int, junction: int, arms: tuple[Arm, Arm], pieces: list[Pi
     return road
 
 
-def _signals(root: Element, roads: list[Element], junction: Junction, lengths: dict[int, float]) -> None:
+def _write_signals(root: Element, roads: list[Element], junction: Junction, lengths: dict[int, float]) -> None:
     """Write a light for every arm, and two controllers: arms along x, then arms along y."""
     element = next(candidate for candidate in root.findall("junction") if candidate.get("id") == str(junction.id))
     groups: dict[int, list[str]] = {}
@@ -366,7 +370,7 @@ def _signed_arms(junction: Junction) -> list[Arm]:
     return [arm for arm, has_opposite in zip(arms, opposites, strict=True) if all(opposites) or not has_opposite]
 
 
-def _signs(
+def _write_signs(
     roads: list[Element], junction: Junction, ruled: list[Arm], lengths: dict[int, float], *, stop: bool
 ) -> None:
     """A stop or yield sign for each of the arms, beside the line where it is waited."""
@@ -399,7 +403,7 @@ def _signs(
         SubElement(post, "validity", fromLane=str(low_lane), toLane=str(high_lane))
 
 
-def _edge(junction: Junction, arm: Arm, offset: float, *, inward: bool) -> Point:
+def _arm_edge_point(junction: Junction, arm: Arm, offset: float, *, inward: bool) -> Point:
     """Return the point at the end of an arm, `offset` m left of the street's middle as seen by traffic in or out."""
     arm_x, arm_y = ahead(junction.place, arm.heading, junction.setback)
     return ahead((arm_x, arm_y), arm.heading + (math.pi if inward else 0.0) + math.pi / 2.0, offset)

@@ -11,17 +11,26 @@ from ssad.scenarios.dynamic.search.box import ParameterBox
 
 
 class Corners:
-    """Corners of the box first, then points drawn evenly; it learns nothing."""
+    """Corners of the box first, then points drawn evenly; it learns nothing.
+
+    Args:
+        bases: Scenarios to start from.
+        seeds: Seed of the search in each.
+        budget: Proposals for each.
+        margin: Distance of the corners from the limits, as a share of the ranges; in a suite
+            `example-corners?margin=0.1`.
+    """
 
     name = "example-corners"
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, margin: float = 0.0) -> None:
         self._points = []
         for base, seed in zip(bases, seeds, strict=True):
             box = ParameterBox.of(base.scenario)
             draw = generator("example corners", seed)
-            corners = [list(map(float, corner)) for corner in product((0, 1), repeat=min(box.dimension, 6))]
-            corners = [corner + [0.5] * (box.dimension - len(corner)) for corner in corners]
+            searched = min(box.dimension, 6)  # a seventh parameter would double the number of corners again
+            rest = [0.5] * (box.dimension - searched)
+            corners = [[*corner, *rest] for corner in product((margin, 1.0 - margin), repeat=searched)]
             order = draw.permutation(len(corners))
             points = [corners[k] for k in order] + draw.random((budget, box.dimension)).tolist()
             self._points.append([box.scenario_at(point) for point in points[:budget]])

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from typing import Any
 
 from ssad.core.seeding import generator
 from ssad.engine.kind import Cell, Column, Job, Kind, Names, SuiteBase
 
 
 class CoinSuite(SuiteBase):
-    """Keys of the YAML file, besides name, title, seed, timeout_s, ..."""
+    """Keys of the YAML file, besides kind, name, title, seed, timeout_s, ..."""
 
-    kind: Literal["example-coin"] = "example-coin"
     systems: Names
     tosses: int = 10
 

@@ -44,4 +44,7 @@ SCENARIO = ScenarioType(
         Parameter("speed", 0.5, 4.0, 1.8, "m/s", "speed of the walkers", 0.26),
     ),
     max_distance=150.0,
+    scenarios=(  # what the class stands for in a suite, `scenarios: [ExampleWalkers]`; more are in walkers.yaml
+        Scenario("Walkers/crossing", "ExampleWalkers", "ProvingGround", (Pose(217.0, -5.25), Pose(317.0, -5.25))),
+    ),
 )

@@ -245,7 +245,7 @@ def test_what_is_behind_a_defence_is_checked_in_double() -> None:
         ("jpeg", {"subsampling": "411"}, "choose 420 or 444"),
         ("bits", {"bits": 9}, "must be in 1..8"),
         ("blur", {"sigma": 0.0}, "sigma must be above 0"),
-        ("blur", {"sigm": 1.0}, "defence blur: "),
+        ("blur", {"sigm": 1.0}, "defence 'blur': .*'sigm'"),
         ("resize", {"smallest": 1.0}, "above 0 and below 1"),
     ],
 )

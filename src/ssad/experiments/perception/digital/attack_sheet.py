@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ssad.core.images import read_image
 from ssad.core.types import U8
 from ssad.datasets.drawing import title_on
 from ssad.datasets.nuscenes.camera_truth import scenes_of
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
@@ -38,7 +38,7 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
     rows = []
     with NuScenes(examination.root, examination.version) as dataset:
         scene, frame = frame_with_most_objects(dataset, scenes_of(dataset, split))
-        clean_image = read_image(examination.root / frame.filename)
+        clean_image = read_frame_image(examination.root, frame)
         for spec in [None, *specs]:
             monitored, image = MonitoredDetector(detector), clean_image
             if spec is not None:

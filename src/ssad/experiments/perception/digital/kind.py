@@ -122,7 +122,8 @@ class Digital(OpenLoopKind):
                 source = point.source or (system if point.aware or not point.defence else detector)
                 title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"
                 title += f"/{point.scenes}" if point.scenes else ""
-                inputs = [safeio.dump_json(data), *([victims.weights[point.source]] if point.source else [])]
+                inputs = [safeio.dump_json(data), point.version]
+                inputs += [victims.weights[point.source]] if point.source else []
                 spec = {
                     "attacks": [transfer_point.row for transfer_point in point.specs],
                     "source": source,

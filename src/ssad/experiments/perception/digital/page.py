@@ -160,14 +160,14 @@ def effort_table(run: DigitalRun) -> Table:
             None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2
         )
 
-    def direct(row: DetectorSetting) -> bool:
+    def is_direct(row: DetectorSetting) -> bool:
         setting = row[1]
         return bool(setting.attack) and not setting.source and (setting.aware or not setting.defence)
 
     return Table.listing(
         "effort",
         "What it took",
-        [row for row, record in run.records.items() if direct(row) and record["status"] == "ok"],
+        [row for row, record in run.records.items() if is_direct(row) and record["status"] == "ok"],
         rows={
             **with_detector(ATTACK | SCENES),
             "Detector": lambda row: ", ".join(filter(None, [row[0], defence_of(row[1])])),

@@ -12,9 +12,10 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.schema import Schema
+from ssad.core.source import plugin_version
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
-from ssad.scenarios.static.digital.defences import RandomResize, make_defence
+from ssad.scenarios.static.digital.defences import DEFENCES, Defence, RandomDefence, make_defence
 from ssad.scenarios.static.digital.objectives import UNDIVIDED
 from ssad.scenarios.static.digital.spec import AttackSpec, has_option
 from ssad.scenarios.static.digital.universal import UniversalFit
@@ -63,7 +64,7 @@ class Guard(Schema):
     """A defence before the detector.
 
     Attributes:
-        name: jpeg, bits, blur or resize.
+        name: jpeg, bits, blur, resize, or module:object.
         options: Further settings, such as quality.
     """
 
@@ -176,6 +177,20 @@ class Guarded:
         """Such as "jpeg quality=50"."""
         return " ".join([self.name, *(f"{key}={value}" for key, value in self.options)])
 
+    @property
+    def version(self) -> str:
+        """Version of a defence of the user's own; "" for one of SSAD."""
+        return plugin_version("defence", DEFENCES, self.name)
+
+    def make(self) -> Defence:
+        """Return the defence.
+
+        Raises:
+            UnknownNameError: There is no such defence.
+            ConfigError: An option is unknown or has an invalid value.
+        """
+        return make_defence(self.name, **dict(self.options))
+
 
 @dataclass(frozen=True)
 class AttackPoint:
@@ -201,6 +216,12 @@ class AttackPoint:
     def attack(self) -> str:
         """Name of the attack; "clean" without one."""
         return self.specs[0].name if len(self.specs) == 1 else ENSEMBLE if self.specs else "clean"
+
+    @property
+    def version(self) -> str:
+        """Versions of the attacks, losses and the defence that are the user's own; "" for those of SSAD."""
+        versions = [spec.version for spec in self.specs] + [self.defence.version if self.defence else ""]
+        return " ".join(filter(None, versions))
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -250,8 +271,8 @@ def guard_of(suite: AttackTable, entry: AttackEntry) -> Guarded | None:
         if entry.aware:
             raise ConfigError(f"suite {suite.name}: attack {entry.name}: aware of which defence? it names none")
         return None
-    make_defence(entry.defence.name, **entry.defence.options)
     defence = Guarded(entry.defence.name, tuple(sorted(entry.defence.options.items())))
+    defence.make()
     if any(not isinstance(value, str | int | float) for _, value in defence.options):
         raise ConfigError(f"suite {suite.name}: defence {defence.name}: options are numbers and words")
     return defence
@@ -273,9 +294,7 @@ def rows_of(suite: AttackTable) -> list[AttackPoint]:
             raise ConfigError(f"suite {suite.name}: attack {ENSEMBLE}: its members have different budgets")
         if not specs:
             draws = (
-                (entry.draws or DRAWS)
-                if defence and entry.aware and isinstance(make_defence(defence.name), RandomResize)
-                else 0
+                (entry.draws or DRAWS) if defence and entry.aware and isinstance(defence.make(), RandomDefence) else 0
             )
             classes, becomes = tuple(entry.classes), tuple(sorted(entry.becomes.items()))
             for name in [*classes, *entry.becomes, *entry.becomes.values()]:

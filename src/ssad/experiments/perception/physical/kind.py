@@ -108,7 +108,7 @@ class Physical(OpenLoopKind):
             source = row.spec.get("light", row.spec).get("source", "")
             grid = suite.grid.model_dump_json() if suite.grid and row.fields["view"] == GRID else ""
             inputs = suite.target, suite.place, suite.size, suite.floor, grid, victims.weights.get(source, "")
-            yield replace(row, inputs=inputs)
+            yield replace(row, inputs=(*inputs, version_of(row.spec)))
         suite.recordings(Path(), "cpu")
 
     def order(self, cell: Cell) -> float:
@@ -196,6 +196,14 @@ class Physical(OpenLoopKind):
     def verdict(self, run: Run) -> list[str]:
         """Return the findings of a run in sentences."""
         return verdict(run)
+
+
+def version_of(spec: Mapping[str, Any]) -> str:
+    """Return the version of the texture or light of a row, if it is one of the user's own; "" for all others."""
+    light = spec.get("light")
+    if light is not None:
+        return LightSpec.of_row(light).version
+    return TextureSpec.of_row(spec).version if spec["attack"] is not None else ""
 
 
 def attacks_of(job: Job) -> TargetAttacks:

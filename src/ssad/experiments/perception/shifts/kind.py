@@ -10,6 +10,7 @@ from pydantic import Field
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
+from ssad.core.registry import Reference, label_of
 from ssad.core.types import U8
 from ssad.engine.kind import Cell, Job, Names
 from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind
@@ -20,9 +21,12 @@ from ssad.experiments.perception.shifts import page
 from ssad.experiments.perception.shifts.verdict import verdict
 from ssad.report.load import Run
 from ssad.report.tables import Table
+from ssad.scenarios.static.catalogue import parse_perturbation, registered_names
+from ssad.scenarios.static.perturbation import Perturbation
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, deal_severities
 from ssad.scenarios.static.shifts.perturbation import Shift
 
+OWN = "own"  # family of the shifts of packages and of the user
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
 
 
@@ -30,7 +34,8 @@ class DetectionSuite(DetectorSuite):
     """One table: 3D detectors x shifts x severities, beside clean data; the first detector is the baseline of mCE.
 
     Attributes:
-        shifts: Names.
+        shifts: Names, or module:object of a class with a method `shift` and an argument `severity`; arguments and a
+            label may follow, as in mine:Haze?density=0.2@haze.
         severities: 1 to 5, or random (dealt to the scenes in equal shares; drawn by sample in the calibration of the
             paper).
         calibration: Calibration of the shifts.
@@ -52,22 +57,24 @@ class Detection(OpenLoopKind):
 
     def check(self, suite: DetectionSuite) -> None:
         """Raise ConfigError for a shift or severity that appears twice or does not exist."""
-        lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
+        lists: dict[str, Sequence[object]] = {"shift": list(map(label_of, suite.shifts)), "severity": suite.severities}
         for key, values in lists.items():
             if len(set(values)) != len(values):
                 raise ConfigError(f"suite {suite.name}: a {key} appears twice")
         for name in suite.shifts:
-            ShiftSpec(name, calibration=suite.calibration)
+            shift_of(name, 1, suite.calibration)
 
     def rows(self, suite: DetectionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the clean data, then each shift at each severity."""
         shifted = list(product(suite.shifts, suite.severities))
         for detector, (shift, severity) in product(victims.files, [(None, 0), *shifted]):
-            family = KNOWN[shift][0] if shift else "clean"
-            fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
-            spec = {"calibration": suite.calibration, "labels": "original"}
-            title = f"{detector}/{shift or 'clean'}/{severity}"
-            yield CellDescription(title, detector, fields, spec, [safeio.dump_json(data)])
+            name = label_of(shift) if shift else None
+            family = family_of(shift) if shift else "clean"
+            fields = {"detector": detector, "shift": name, "family": family, "severity": severity}
+            spec = {"calibration": suite.calibration, "labels": "original", "shift": shift}
+            title = f"{detector}/{name or 'clean'}/{severity}"
+            version = shift_of(shift, 1, suite.calibration).version() if shift else ""
+            yield CellDescription(title, detector, fields, spec, [safeio.dump_json(data), version])
 
     def versions(self, suite: DetectionSuite) -> dict[str, str]:
         """Return the version of the shifts."""
@@ -86,10 +93,12 @@ class Detection(OpenLoopKind):
         A severity dealt to a scene is one of the five: its boxes are shared with that cell.
         """
         tokens: Mapping[str, str] = job.settings["scenes"]
-        shift, severity, calibration = cell.fields["shift"], cell.fields["severity"], cell.spec["calibration"]
-        if shift is None or severity != "random" or calibration == "paper":
+        shift, severity, calibration = cell.spec["shift"], cell.fields["severity"], cell.spec["calibration"]
+        is_dealt = severity == "random" and (calibration != "paper" or family_of(shift) == OWN)
+        if shift is None or not is_dealt:
             return [shifted_scene(shift, severity, calibration, scene) for scene in tokens]
-        spec = ShiftSpec(shift, seed=cell.seed, calibration=calibration)
+        # A shift of the user's own has no specification: it is dealt like uniform noise.
+        spec = ShiftSpec(shift if shift in KNOWN else "uniform", seed=cell.seed, calibration=calibration)
         severity_by_token = deal_severities(spec, tokens.values())
         return [shifted_scene(shift, severity_by_token[token], calibration, scene) for scene, token in tokens.items()]
 
@@ -99,7 +108,7 @@ class Detection(OpenLoopKind):
         """Return a picture of one moment under each shift, and its caption."""
         shifts, severities = suite.shifts, suite.severities
         if cell is not None:
-            shifts = [cell.fields["shift"]] if cell.fields["shift"] else []
+            shifts = [cell.spec["shift"]] if cell.spec["shift"] else []
             severities = [cell.fields["severity"]]
         severity = min(
             [level for level in severities if isinstance(level, int)] or [STRONG], key=lambda level: abs(level - STRONG)
@@ -108,7 +117,7 @@ class Detection(OpenLoopKind):
             f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
             f"and under each shift at severity {severity}."
         )
-        perturbations = [Shift(shift, severity, suite.calibration) for shift in shifts]
+        perturbations = [shift_of(shift, severity, suite.calibration) for shift in shifts]
         return lambda: detection_sheet(examination, suite.split, perturbations), caption
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
@@ -126,4 +135,35 @@ class Detection(OpenLoopKind):
 
 def shifted_scene(shift: str | None, severity: int | str, calibration: Calibration, scene: str) -> SceneCondition:
     """Return a scene under a shift at a severity; None: the clean scene."""
-    return SceneCondition(scene, None if shift is None else Shift(shift, severity, calibration))
+    return SceneCondition(scene, None if shift is None else shift_of(shift, severity, calibration))
+
+
+def family_of(shift: str) -> str:
+    """Return the family of a shift of SSAD; `OWN` for one of a package or of the user."""
+    name = Reference.parse(shift).name
+    is_own = name not in KNOWN and (":" in name or registered_names().get(name) == "shift")
+    return OWN if is_own else ShiftSpec(shift).family
+
+
+def shift_of(shift: str, severity: int | str, calibration: Calibration) -> Perturbation:
+    """Return a shift at a severity.
+
+    Args:
+        shift: Name; of a shift of the user's own with arguments and label.
+        severity: 1 to 5; "random" for a shift of SSAD alone.
+        calibration: Calibration of the shifts of SSAD.
+
+    Raises:
+        UnknownNameError: There is no such shift.
+        ConfigError: The user's shift cannot be made, or has no severities.
+    """
+    if family_of(shift) != OWN:
+        return Shift(shift, severity, calibration)
+    entry = parse_perturbation({"shift": shift})
+    if not entry.has_severities:
+        raise ConfigError(
+            f"shift '{shift}' has no severities: give its class an argument severity, or name it in a suite of kind "
+            "perception"
+        )
+    assert isinstance(severity, int)
+    return entry.make(severity)

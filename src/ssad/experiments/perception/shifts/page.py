@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ssad.core.errors import ConfigError
-from ssad.core.registry import split_weights
+from ssad.core.registry import label_of, split_weights
 from ssad.metrics import replicate_estimate
 from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.rank import family_correlation
@@ -27,7 +27,7 @@ from ssad.report.tables import Table, TableCell, TableRow
 TEMPLATE = Path(__file__).with_name("page.html")
 
 SOURCE = "published by the paper: nuScenes val, severities drawn from 1 to 5"
-FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "clean": "Clean"}
+FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "own": "Own", "clean": "Clean"}
 TITLES = {"uniform": "uniform noise", "gaussian": "gaussian noise", "impulse": "impulse noise", "": "clean"}
 SCORES = ("mAP", "NDS")
 """Scores of a table, in the order of the published ones."""
@@ -71,7 +71,7 @@ class DetectionRun:
     @property
     def shifts(self) -> list[str]:
         """Shifts in the order of the suite, without the clean data."""
-        return list(self.suite["shifts"])
+        return [label_of(shift) for shift in self.suite["shifts"]]
 
     @property
     def numbers(self) -> list[str]:

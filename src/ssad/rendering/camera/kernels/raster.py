@@ -44,14 +44,14 @@ def project_point(p: wp.vec3, lens: wp.vec4, scale: float, ortho: int) -> wp.vec
 
 
 @wp.func
-def cut(p: wp.vec3, q: wp.vec3, near: float) -> wp.vec3:
+def clip_edge(p: wp.vec3, q: wp.vec3, near: float) -> wp.vec3:
     """Return the point where the edge from p to q meets the near plane."""
     t = (near - p[2]) / (q[2] - p[2])
     return wp.vec3(p[0] + (q[0] - p[0]) * t, p[1] + (q[1] - p[1]) * t, near)
 
 
 @wp.func
-def outside(t: Triangle, width: float, height: float) -> int:
+def is_outside(t: Triangle, width: float, height: float) -> int:
     """Return 1 unless the triangle faces the camera and its extent meets the image."""
     area = (t.b[0] - t.a[0]) * (t.c[1] - t.a[1]) - (t.b[1] - t.a[1]) * (t.c[0] - t.a[0])
     # y points down in samples: a face that is counter-clockwise seen from outside has a negative area.
@@ -65,7 +65,7 @@ def outside(t: Triangle, width: float, height: float) -> int:
 
 
 @wp.func
-def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
+def edge_crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
     """Return the x where an edge crosses a row; both triangles that share the edge get the same number."""
     # The order of the end points fixes the rounding, so that shared edges leave no gap.
     if p[1] < q[1] or (p[1] == q[1] and p[0] < q[0]):
@@ -80,15 +80,15 @@ def fill_row(t: Triangle, y: int, samples: wp.array3d(dtype=wp.uint64), gx: floa
     left = float(1.0e9)
     right = float(-1.0e9)
     if (t.a[1] <= sample_y) != (t.b[1] <= sample_y):
-        x = crossing(t.a, t.b, sample_y)
+        x = edge_crossing(t.a, t.b, sample_y)
         left = wp.min(left, x)
         right = wp.max(right, x)
     if (t.b[1] <= sample_y) != (t.c[1] <= sample_y):
-        x = crossing(t.b, t.c, sample_y)
+        x = edge_crossing(t.b, t.c, sample_y)
         left = wp.min(left, x)
         right = wp.max(right, x)
     if (t.c[1] <= sample_y) != (t.a[1] <= sample_y):
-        x = crossing(t.c, t.a, sample_y)
+        x = edge_crossing(t.c, t.a, sample_y)
         left = wp.min(left, x)
         right = wp.max(right, x)
     left = wp.clamp(left, -1.0, float(samples.shape[2]) + 1.0)
@@ -136,7 +136,7 @@ def enter(
     count: wp.array(dtype=int),
 ):  # fmt: skip
     """Enter a triangle into the samples, or list it in `large` if it is large and there is room, see `fill`."""
-    if outside(t, float(samples.shape[2]), float(samples.shape[1])) == 1:
+    if is_outside(t, float(samples.shape[2]), float(samples.shape[1])) == 1:
         return
     rows = rows_of(t, samples.shape[1])
     width = wp.max(t.a[0], wp.max(t.b[0], t.c[0])) - wp.min(t.a[0], wp.min(t.b[0], t.c[0]))
@@ -216,13 +216,13 @@ def fill(
                     if r[2] >= plane:
                         triangle.c = project_point(r, focal, scale, ortho)
                     else:
-                        triangle.c = project_point(cut(q, r, plane), focal, scale, ortho)
+                        triangle.c = project_point(clip_edge(q, r, plane), focal, scale, ortho)
                 else:
-                    triangle.b = project_point(cut(p, q, plane), focal, scale, ortho)
+                    triangle.b = project_point(clip_edge(p, q, plane), focal, scale, ortho)
                     if r[2] >= plane:
-                        triangle.c = project_point(cut(r, q, plane), focal, scale, ortho)
+                        triangle.c = project_point(clip_edge(r, q, plane), focal, scale, ortho)
                     else:
-                        triangle.c = project_point(cut(p, r, plane), focal, scale, ortho)
+                        triangle.c = project_point(clip_edge(p, r, plane), focal, scale, ortho)
                 pieces = int(1)
                 if (q[2] >= plane) != (r[2] >= plane):
                     pieces = 2  # one corner behind the plane: four corners remain
@@ -231,7 +231,7 @@ def fill(
                         triangle.slot += 1
                         triangle.b = triangle.c
                         if q[2] >= plane:
-                            triangle.c = project_point(cut(p, r, plane), focal, scale, ortho)
+                            triangle.c = project_point(clip_edge(p, r, plane), focal, scale, ortho)
                         else:
                             triangle.c = project_point(r, focal, scale, ortho)
                     enter(triangle, largest, samples, large, count)

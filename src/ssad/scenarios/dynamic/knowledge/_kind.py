@@ -110,6 +110,7 @@ class ScenarioType:
         traffic: Default traffic.
         max_distance: Maximum distance of the ego, m.
         whole_town: The signal plan covers every signal of the map, not only the junctions on the route.
+        scenarios: Scenarios that the name of the class stands for in a suite; those of SSAD's classes are in its sets.
     """
 
     name: str
@@ -121,6 +122,7 @@ class ScenarioType:
     traffic: TrafficPlan | None = None
     max_distance: float = 1.0e9
     whole_town: bool = False
+    scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.box) != len(self.parameters) + len(EGO_START):

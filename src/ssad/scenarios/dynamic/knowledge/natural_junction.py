@@ -98,7 +98,7 @@ def spawn_candidates(graph: LaneGraph, route: Route) -> tuple[tuple[LanePosition
     accepted = []
     for place in spawn_places(graph):
         road, lane_id = int(graph.road[place.lane]), int(graph.lane_id[place.lane])
-        opposite = road == int(graph.road[first_lane]) and lane_id * int(graph.lane_id[first_lane]) < 0
+        opposite = road == int(graph.road[first_lane]) and graph.forward[place.lane] != graph.forward[first_lane]
         if opposite or (road, lane_id) in ego_lanes:
             continue
         pose = pose_at(graph, place)

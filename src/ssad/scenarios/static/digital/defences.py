@@ -14,15 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
-from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.registry import Reference, check_arguments, make, resolve
 from ssad.core.seeding import generator
 from ssad.rendering.camera.torch_jpeg import jpeg, quantisation
 from ssad.scenarios.static.digital.budget import LEVELS
@@ -51,6 +52,18 @@ class Defence(Protocol):
         """Transform images [B, 3, H, W] in [0, 1] into images of the same shape, differentiably.
 
         Each output depends on its own image alone.
+        """
+
+
+@runtime_checkable
+class RandomDefence(Defence, Protocol):
+    """Defence that draws at random, and can hold a draw for an attack that averages over several."""
+
+    def fixed_draw(self, number: int) -> Callable[[Tensor], Tensor]:
+        """Return the transformation of one draw, the same for all images.
+
+        Args:
+            number: Number of the draw.
         """
 
 
@@ -225,26 +238,32 @@ def _in_range(images: Tensor) -> Tensor:
     return images.clamp(0.0, 1.0).detach() + (images - images.detach())
 
 
-DEFENCES: dict[str, Callable[..., Any]] = {"jpeg": Jpeg, "bits": BitDepth, "blur": Blur, "resize": RandomResize}
+_HERE = "ssad.scenarios.static.digital.defences"
+DEFENCES: dict[str, str] = {
+    "jpeg": f"{_HERE}:Jpeg",
+    "bits": f"{_HERE}:BitDepth",
+    "blur": f"{_HERE}:Blur",
+    "resize": f"{_HERE}:RandomResize",
+}
 
 
 def make_defence(name: str, **options: Any) -> Defence:
     """Create a defence by name.
 
     Args:
-        name: Key of `DEFENCES`.
-        **options: Arguments of its constructor.
+        name: Key of `DEFENCES`, entry point of the group `ssad.defences`, or "module:object"; arguments may follow.
+        **options: Arguments of its class or function.
 
     Raises:
         UnknownNameError: There is no such defence.
         ConfigError: An option is unknown or has an invalid value.
     """
-    if name not in DEFENCES:
-        raise unknown_name("defence", name, DEFENCES)
-    try:
-        defence: Defence = DEFENCES[name](**options)
-    except TypeError as error:
-        raise ConfigError(f"defence {name}: {error}") from None
+    reference = Reference.parse(name)
+    target = resolve("defence", DEFENCES, reference.name)
+    check_arguments("defence", name, target, extra_arguments=options)
+    defence: Defence = make(
+        "defence", reference.name, target, {**reference.options, **options}, ("name", "smooth", "__call__")
+    )
     return defence
 
 

@@ -12,14 +12,14 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access, Attack
 from ssad.scenarios.static.digital.budget import Budget
-from ssad.scenarios.static.digital.defences import Defended, RandomResize
+from ssad.scenarios.static.digital.defences import Defended, RandomDefence
 from ssad.scenarios.static.digital.victim import Through, Victim
 
 
 class _ExpectedVictim(Victim):
     """Victim whose loss is the mean over draws of a random defence."""
 
-    def __init__(self, victim: Victim, defence: RandomResize, draws: Sequence[Through]) -> None:
+    def __init__(self, victim: Victim, defence: RandomDefence, draws: Sequence[Through]) -> None:
         # Share the state of the victim: building a new one would repeat its target assignment.
         self.__dict__.update(vars(victim))
         bare = victim.detector
@@ -60,7 +60,7 @@ class Expected:
     """
 
     inner: Attack
-    defence: RandomResize
+    defence: RandomDefence
     draws: int = 8
 
     def __post_init__(self) -> None:

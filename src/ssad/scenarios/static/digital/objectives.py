@@ -20,6 +20,7 @@ from torch.nn import functional
 from ssad.core.detections import Assignment, Dense
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.protocols import Detector
+from ssad.core.registry import Reference, check_arguments, make, resolve
 from ssad.core.tensor_boxes import iou
 
 TERMS: Mapping[str, frozenset[str]] = {
@@ -298,6 +299,10 @@ OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
 }
 
 
+LOSSES: Mapping[str, str] = dict.fromkeys(OBJECTIVES, __name__)
+"""Built-in objectives and the module that defines them."""
+
+
 UNDIVIDED = frozenset({"full", *TERMS, "fabricate"})
 """Objectives that are of all objects, and take no aim at some."""
 
@@ -305,12 +310,20 @@ UNDIVIDED = frozenset({"full", *TERMS, "fabricate"})
 def make_objective(name: str) -> Objective:
     """Create an objective by name.
 
+    Args:
+        name: Key of `OBJECTIVES`, entry point of the group `ssad.losses`, or "module:object"; arguments may follow.
+
     Raises:
         UnknownNameError: There is no such objective.
+        ConfigError: An argument is unknown, or the object is no objective.
     """
-    if name not in OBJECTIVES:
-        raise unknown_name("loss", name, OBJECTIVES)
-    return OBJECTIVES[name]()
+    reference = Reference.parse(name)
+    target = OBJECTIVES.get(reference.name) or resolve("loss", LOSSES, reference.name)
+    check_arguments("loss", name, target)
+    objective: Objective = make(
+        "loss", reference.name, target, reference.options, ("name", "needs_objects", "__call__")
+    )
+    return objective
 
 
 def log_scores(dense: Dense) -> Tensor:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import file_name
-from ssad.core.source import source_version
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.live import LiveAttack
 from ssad.scenarios.static.digital.live_universal import universal_change
@@ -56,9 +55,8 @@ class DigitalAttack(Perturbation):
         return self.spec.make().access != "none"
 
     def version(self) -> str:
-        """Return 12 hex digits over the source of an attack of the user's own; "" for one of SSAD's."""
-        module = type(self.spec.make()).__module__
-        return "" if module.startswith("ssad.") else source_version(module)
+        """Return the versions of an attack and a loss of the user's own; "" for those of SSAD."""
+        return self.spec.version
 
     def on_scene(self, scene: RecordedScene, victim: SceneVictim | None) -> PerturbedScene:
         """Return attacked images, made once against the victim; the notes are the cost of the attack.

@@ -16,16 +16,16 @@ from torch import Tensor
 
 from ssad.core.detections import Truth, to_images
 from ssad.core.errors import ConfigError
-from ssad.core.images import read_image
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import camera_truth
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.scenarios.static.digital import Attack, AttackResult, Budget, make_objective, px, run_attack
 from ssad.scenarios.static.digital.budget import LEVELS
 from ssad.scenarios.static.digital.chosen_object import chosen_first
-from ssad.scenarios.static.digital.defences import RandomResize
+from ssad.scenarios.static.digital.defences import RandomDefence
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.reference_ensemble import compare_with_references, is_judged
@@ -80,7 +80,7 @@ class SceneAttacker:
     def _with_draws(self, attack: Attack) -> Attack:
         """Return the attack, made to know the random defence of the detector if the spec says so."""
         defence = getattr(self.watched.detector, "defence", None)
-        if self.spec.draws and isinstance(defence, RandomResize):
+        if self.spec.draws and isinstance(defence, RandomDefence):
             return Expected(attack, defence, self.spec.draws)
         return attack
 
@@ -109,7 +109,7 @@ class SceneAttacker:
         return images
 
     def _read(self, frame: SensorFrame) -> U8:
-        return read_image(self.recorded.root / frame.filename)
+        return read_frame_image(self.recorded.root, frame)
 
     def _truth(self, frame: SensorFrame, scene: SceneData | None = None) -> Truth:
         """Return the truth of a frame, with the labels of the attacked detector; other classes are left out.

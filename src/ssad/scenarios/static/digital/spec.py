@@ -9,8 +9,10 @@ from typing import Any, Self
 
 from ssad.core.registry import resolve
 from ssad.core.seeding import file_name
+from ssad.core.source import plugin_version
 from ssad.scenarios.static.digital import ATTACKS, Aim, Attack, make_attack
 from ssad.scenarios.static.digital.budget import Norm
+from ssad.scenarios.static.digital.objectives import LOSSES
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.scenarios.static.digital.victim import Precision
 
@@ -94,6 +96,12 @@ class AttackSpec:
         """Attacked objects and their target classes in words: "nearest car", "car to bus"; "": all."""
         changes = [f"{source_class} to {target_class}" for source_class, target_class in self.becomes]
         return " ".join(filter(None, [self.object, ", ".join(changes or self.classes)]))
+
+    @property
+    def version(self) -> str:
+        """Versions of an attack and a loss of the user's own; "" for those of SSAD."""
+        versions = plugin_version("attack", ATTACKS, self.attack), plugin_version("loss", LOSSES, self.loss)
+        return " ".join(filter(None, versions))
 
     @property
     def passes(self) -> int:

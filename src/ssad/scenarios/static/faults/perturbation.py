@@ -16,10 +16,10 @@ import numpy as np
 
 from ssad.core.driving import CommandChange, ReadingChange, StateChange
 from ssad.core.errors import ConfigError
-from ssad.core.images import read_image
 from ssad.core.seeding import generator
 from ssad.core.source import source_version
 from ssad.core.types import U8
+from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.scenarios.static.faults.camera import CameraFault
 from ssad.scenarios.static.perturbation import (
@@ -120,7 +120,7 @@ class Fault(Perturbation):
         def look(frames: Sequence[SensorFrame]) -> list[U8]:
             images = []
             for frame in frames:
-                image = read_image(scene.root / frame.filename)
+                image = read_frame_image(scene.root, frame)
                 if frame.channel in faults:
                     moment = RecordedMoment(np.array([(frame.timestamp_us - start) / 1e6]))
                     draws = [generator("perturbation", scene.seed, frame.scene_token, frame.channel, frame.token)]

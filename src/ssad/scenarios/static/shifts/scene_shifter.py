@@ -8,18 +8,16 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import FormatError
 from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame
-from ssad.core.images import read_image
+from ssad.core.image_files import read_image_file
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
-from ssad.core.safeio import read_bytes
 from ssad.core.types import F32, F64, U8
-from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_points
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 from ssad.scenarios.static.shifts import (
     ShiftSpec,
@@ -206,9 +204,10 @@ class SceneShifter:
         path = self.root / "depth" / frame.channel / f"{frame.token}.png"
         if not path.is_file():
             return None
-        codes = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
-        if codes is None or codes.dtype != np.uint16 or codes.ndim != 2:
+        depth_map = read_image_file(path)
+        if not depth_map.has_16_bits or depth_map.pixels.shape[2] != 1:
             raise FormatError(f"{path}: not a depth map of 16 bits")
+        codes = depth_map.pixels[..., 0]
         # The inverse of `depth_bytes` of the recorder: 64 steps per metre, 65535 for the sky.
         return np.where(codes == 65535, np.inf, codes / 64).astype(np.float32)
 
@@ -293,13 +292,7 @@ class SceneShifter:
         Raises:
             FormatError: The image cannot be read, or its size contradicts the tables.
         """
-        image = read_image(self.root / frame.filename)
-        if frame.width and image.shape[:2] != (frame.height, frame.width):
-            raise FormatError(
-                f"{self.root / frame.filename}: {image.shape[1]} x {image.shape[0]} pixels, "
-                f"the tables say {frame.width} x {frame.height}"
-            )
-        return image
+        return read_frame_image(self.root, frame)
 
     def images(
         self, frames: Sequence[SensorFrame], *, clean: Sequence[U8] | None = None, device: str | None = None

@@ -29,6 +29,9 @@ LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
     "flashlight": Flashlight,
 }
 
+BUILT_IN: dict[str, str] = dict.fromkeys(LIGHTS, __name__)
+"""Built-in light attacks and the package that defines them."""
+
 
 def make_light(name: str, options: Mapping[str, Any]) -> Any:
     """Create a light attack by name.

@@ -16,8 +16,10 @@ from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
 from ssad.core.schema import build_validated
 from ssad.core.seeding import digest
+from ssad.core.source import plugin_version
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights import (
+    BUILT_IN,
     Projector,
     SearchBudget,
     TargetSize,
@@ -63,6 +65,11 @@ class LightSpec:
     def device(self) -> str:
         """Name of the light or card, also for random settings."""
         return self.of or self.attack
+
+    @property
+    def version(self) -> str:
+        """Version of a light of the user's own; "" for one of SSAD, and for no light."""
+        return plugin_version("light", BUILT_IN, self.device) if self.device else ""
 
     @property
     def name(self) -> str:

@@ -15,13 +15,13 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.source import source_version
+from ssad.core.source import plugin_version
 from ssad.core.types import AgentKind, Episode
 from ssad.rendering.camera.scene_edit import NO_EDIT
 from ssad.rendering.hours import at_hour
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import EGO, Perturbation, TargetImages
-from ssad.scenarios.static.physical.lights import LIGHTS, Projector, TargetSize, make_light, random_settings
+from ssad.scenarios.static.physical.lights import BUILT_IN, LIGHTS, Projector, TargetSize, make_light, random_settings
 from ssad.scenarios.static.physical.lights.export import LightSetup, load_light
 from ssad.world.models import MODELS
 
@@ -117,8 +117,7 @@ class LightPerturbation(Perturbation):
     def version(self) -> str:
         """Return the hash of an exported light or of a user's module; "" for the others, which the code decides."""
         if self.exported is None:
-            module = "" if self.light == NIGHT else type(make_light(self.light, self.options)).__module__
-            return "" if not module or module.startswith("ssad.") else source_version(module)
+            return "" if self.light == NIGHT else plugin_version("light", BUILT_IN, self.light)
         files = (self.exported / file_name for file_name in ("light.json", "picture.npz"))
         return hashlib.sha256(b"".join(safeio.read_bytes(file) for file in files if file.is_file())).hexdigest()
 

@@ -11,6 +11,9 @@ from ssad.core import safeio
 from ssad.core.errors import unknown_name
 from ssad.core.schema import build_validated
 from ssad.core.seeding import digest
+from ssad.core.source import plugin_version
+from ssad.scenarios.static.digital.objectives import LOSSES
+from ssad.scenarios.static.physical.textures.attacks import ATTACKS
 from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, RoadPatch
 from ssad.scenarios.static.physical.textures.controls import CONTROLS
 
@@ -54,6 +57,15 @@ class TextureSpec:
     def trained(self) -> str:
         """Attack to train, also for a texture that is shuffled afterwards; "" without training."""
         return (self.of or self.attack) if self.source and self.file is None else ""
+
+    @property
+    def version(self) -> str:
+        """Versions of an attack and a loss of the user's own; "" for those of SSAD, and without training."""
+        if not self.trained:
+            return ""
+        versions, loss = [plugin_version("physical-attack", ATTACKS, self.trained)], self.settings.get("objective")
+        versions += [plugin_version("loss", LOSSES, loss)] if isinstance(loss, str) else []
+        return " ".join(filter(None, versions))
 
     @property
     def name(self) -> str:

@@ -96,7 +96,7 @@ def refract(
 
 
 @wp.func
-def wrapped(value: float, period: float) -> float:
+def wrap_coordinate(value: float, period: float) -> float:
     """Return a coordinate of a periodic field, in [-period / 2, period / 2)."""
     return value - period * wp.floor(value / period + 0.5)
 
@@ -142,9 +142,9 @@ def splat(
     tile_position = wp.vec3(unit(first, 0) * air.tile[0], unit(first, 16) * air.tile[1], unit(first, 32) * air.tile[2])
     particle_position = tile_position + drift * age - position[b]
     particle_position = wp.vec3(
-        wrapped(particle_position[0], air.tile[0]),
-        wrapped(particle_position[1], air.tile[1]),
-        wrapped(particle_position[2], air.tile[2]),
+        wrap_coordinate(particle_position[0], air.tile[0]),
+        wrap_coordinate(particle_position[1], air.tile[1]),
+        wrap_coordinate(particle_position[2], air.tile[2]),
     )
     # most particles are far outside the image
     focal = lens[b]

@@ -1,22 +1,22 @@
 """CARLA leaderboard agents as driving systems: `setup`, `sensors`, `run_step`, without CARLA.
 
 `--set systems=[leaderboard:FILE.py]` takes the class that FILE's `get_entry_point` names; a second colon
-introduces the path passed to `setup`. Where the packages `leaderboard`, `agents` and `carla` are not installed,
-minimal stand-ins provide the names that agents need.
+introduces the path passed to `setup`. Where the packages `leaderboard`, `srunner`, `agents` and `carla` are not
+installed, stand-ins provide the names that agents need.
 
-Each episode has its own agent. Agents receive (number of the step, data) by id of the sensor. Frames are
-CARLA's, left-handed: y to the right, yaw clockwise. Source of the interface: the leaderboard's
-autoagents/autonomous_agent.py and its pages on sensors.
+Each episode has its own agent; with `?share=true` the agents of a batch share their networks. Agents receive (number
+of the step, data) by id of the sensor. Frames are CARLA's, left-handed: y to the right, yaw clockwise. Source of the
+interface: the leaderboard's autoagents/autonomous_agent.py, agent_wrapper.py and leaderboard_evaluator.py (20 Hz, the
+plan before `setup`, noise of GNSS and IMU).
 """
 
 from __future__ import annotations
 
-import enum
+import copy
 import hashlib
 import importlib.util
 import math
 import sys
-import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -30,8 +30,12 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes
+from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, Controller, Episode, Route
-from ssad.drivers.leaderboard_sensors import (
+from ssad.drivers.leaderboard.carla_types import AutonomousAgent
+from ssad.drivers.leaderboard.road_map import OPTIONS, TownMap, road_options, transform_of
+from ssad.drivers.leaderboard.scene import STEP, CarlaDataProvider, HostedScene
+from ssad.drivers.leaderboard.sensors import (
     CAMERA,
     LIDAR,
     MAP,
@@ -41,71 +45,16 @@ from ssad.drivers.leaderboard_sensors import (
     check_sensors,
     geolocation,
     lidar_of,
+    number,
     radar_of,
 )
+from ssad.drivers.leaderboard.stand_ins import install_stand_ins
 from ssad.rendering.lidar import Lidar
 from ssad.world.roads import load_town, town_xodr
 
 GRAVITY: Final = 9.81  # m/s^2
-STEP: Final = 0.1  # s
-TURN: Final = math.radians(30.0)  # a path through a junction that turns less counts as straight
-APART: Final = 50.0  # m between the plan points that the base class keeps
-
-
-class RoadOption(enum.IntEnum):
-    """Command of the plan at a point, as in CARLA's agents.navigation.local_planner."""
-
-    VOID = -1
-    LEFT = 1
-    RIGHT = 2
-    STRAIGHT = 3
-    LANEFOLLOW = 4
-    CHANGELANELEFT = 5
-    CHANGELANERIGHT = 6
-
-
-class Track(enum.Enum):
-    """Permitted inputs of an agent, as in the leaderboard."""
-
-    SENSORS = "SENSORS"
-    MAP = "MAP"
-    SENSORS_QUALIFIER = "SENSORS_QUALIFIER"
-    MAP_QUALIFIER = "MAP_QUALIFIER"
-
-
-class AutonomousAgent:
-    """Base class of agents where the package `leaderboard` is not installed."""
-
-    def __init__(self, carla_host: str = "", carla_port: int = 0, debug: bool = False) -> None:
-        self.track = Track.SENSORS
-        self._global_plan: Any = None
-        self._global_plan_world_coord: Any = None
-        self.sensor_interface = None
-        self.wallclock_t0 = None
-
-    def set_global_plan(self, global_plan_gps: Sequence[Any], global_plan_world_coord: Sequence[Any]) -> None:
-        """Keep a point of the plan every 50 m, and where the command changes."""
-        indices, last_index = [0], 0
-        for index in range(1, len(global_plan_gps)):
-            if (
-                index == len(global_plan_gps) - 1
-                or index - last_index >= APART
-                or global_plan_gps[index][1] != global_plan_gps[index - 1][1]
-            ):
-                indices.append(index)
-                last_index = index
-        self._global_plan = [global_plan_gps[index] for index in indices]
-        self._global_plan_world_coord = [global_plan_world_coord[index] for index in indices]
-
-    def setup(self, path_to_conf_file: str) -> None:
-        """Prepare the agent; to be overridden."""
-
-    def sensors(self) -> list[dict[str, Any]]:
-        """Return the sensors of the agent; to be overridden."""
-        return []
-
-    def destroy(self) -> None:
-        """Clean up; to be overridden."""
+GNSS_NOISE: Final = (5e-6, 5e-6, 5e-6)  # standard deviations of latitude and longitude, degrees, and altitude, m
+IMU_NOISE: Final = (1e-3, 1e-3, 1.5e-2, 1e-3, 1e-3, 1e-3, 0.0)  # accelerations m/s^2, rates rad/s, compass rad
 
 
 class Leaderboard:
@@ -113,15 +62,20 @@ class Leaderboard:
 
     Args:
         path: File of the agent, optionally followed by a colon and the argument of `setup`.
+        share: Whether `setup` runs once, and the agents of all episodes are copies of that one with the same networks
+            (`torch.nn.Module`). A network that remembers something from step to step must not be shared.
 
     Raises:
-        ConfigError: The file has no agent, fails to import, or requests an unknown sensor.
+        ConfigError: The file has no agent, fails to import, or requests an unknown sensor; with `share` it cannot be
+            copied.
     """
 
     name = "leaderboard"
     controller = Controller.EXTERNAL
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, *, share: bool = False) -> None:
+        if not isinstance(share, bool):
+            raise ConfigError(f"system 'leaderboard:{path}': share is true or false, not {share}")
         file, _, self._config = path.partition(":")
         self.path = Path(file)
         try:
@@ -130,7 +84,9 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{path}': {error}") from None
         self.version = hashlib.sha256(source + self._config.encode()).hexdigest()
         self._agent_class = self._load_agent_class(path)
-        self._specifications = self._sensors()
+        template = self._make_agent()
+        self._specifications = self._sensors(template)
+        self._template: Any = template if share else None
         self.cameras: Mapping[str, Camera] = {
             specification["id"]: camera_of(specification)
             for specification in self._specifications
@@ -148,11 +104,13 @@ class Leaderboard:
         }
         self.sensors = (*self.cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
+        self._episodes: list[Episode] = []
+        self._scenes: list[HostedScene] = []
         self._last_headings: dict[int, tuple[float, float]] = {}
         self._maps: list[str] = []
 
     def _load_agent_class(self, path: str) -> type:
-        _install_stand_ins()
+        install_stand_ins()
         spec = importlib.util.spec_from_file_location(f"leaderboard_agent_{self.version[:12]}", self.path)
         if spec is None or spec.loader is None:
             raise ConfigError(f"system 'leaderboard:{path}': expected the path of a Python file")
@@ -173,21 +131,42 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{path}': its get_entry_point() names no class with run_step")
         return agent_class
 
-    def _make_agent(self) -> Any:
-        """Make and set up an agent. Leaderboard 2.0 constructs from host and port, 1.0 from the configuration."""
+    def _make_agent(self, plan: tuple[list[Any], list[Any]] | None = None) -> Any:
+        """Make an agent, give it its plan and set it up, in the order of the leaderboard.
+
+        Leaderboard 2.0 constructs from host and port, 1.0 from the configuration, which sets the agent up.
+        """
         try:
             try:
                 agent = self._agent_class("localhost", 2000)
             except TypeError:
-                return self._agent_class(self._config)
+                agent = self._agent_class(self._config)
+                if plan is not None:
+                    agent.set_global_plan(*plan)
+                if isinstance(agent, AutonomousAgent):
+                    agent.setup(self._config)
+                return agent
+            if plan is not None:
+                agent.set_global_plan(*plan)
             agent.setup(self._config)
         except Exception as error:
             raise ConfigError(f"system 'leaderboard:{self.path}': setup failed: {describe(error)}") from error
         return agent
 
-    def _sensors(self) -> list[dict[str, Any]]:
+    def _copy_agent(self, plan: tuple[list[Any], list[Any]]) -> Any:
+        """Return a copy of the agent that was set up, with the same networks and a plan of its own."""
+        try:
+            agent: Any = copy.deepcopy(self._template, {id(network): network for network in _networks(self._template)})
+        except Exception as error:
+            raise ConfigError(
+                f"system 'leaderboard:{self.path}': share=true: it cannot be copied: {describe(error)}; leave share out"
+            ) from error
+        agent.set_global_plan(*plan)
+        return agent
+
+    def _sensors(self, agent: Any) -> list[dict[str, Any]]:
         """Return the validated sensor specifications of an agent."""
-        agent, location = self._make_agent(), f"system 'leaderboard:{self.path}'"
+        location = f"system 'leaderboard:{self.path}'"
         try:
             specifications = agent.sensors()
         except Exception as error:
@@ -195,19 +174,27 @@ class Leaderboard:
         return check_sensors(specifications, location)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """Make a new agent for each episode, with the plan of its route."""
+        """Make an agent for each episode, with the plan of its route."""
         for agent in self._agents:
             getattr(agent, "destroy", lambda: None)()
-        self._agents, self._last_headings = [], {}
+        self._agents, self._scenes, self._last_headings = [], [], {}
+        self._episodes = list(episodes)
         wants_map = any(specification["type"] == MAP for specification in self._specifications)
         self._maps = [town_xodr(episode.town) if wants_map else "" for episode in episodes]
+        town_maps = {town: TownMap(load_town(town)) for town in {episode.town for episode in episodes}}
         for episode in episodes:
-            agent = self._make_agent()
-            agent.sensors()  # some agents initialise themselves in sensors()
             route = episode.agents[0].route
             assert route is not None
-            gps_plan, world_plan = _global_plan(route, load_town(episode.town))
-            agent.set_global_plan(gps_plan, world_plan)
+            town_map = town_maps[episode.town]
+            plan = _global_plan(route, town_map.graph)
+            scene = HostedScene(town_map, route, plan[1])
+            CarlaDataProvider.enter(scene)
+            try:
+                agent = self._make_agent(plan) if self._template is None else self._copy_agent(plan)
+                agent.sensors()  # some agents initialise themselves in sensors()
+            finally:
+                CarlaDataProvider.enter(None)
+            self._scenes.append(scene)
             self._agents.append(agent)
 
     def act(self, view: Observation) -> F32:
@@ -216,7 +203,12 @@ class Leaderboard:
         for row, scene in enumerate(view.scene.tolist()):
             if view.done[row]:
                 continue
-            control = self._agents[scene].run_step(self._agent_input(view, row), float(view.time[row]))
+            self._scenes[scene].observe(view, row)
+            CarlaDataProvider.enter(self._scenes[scene])
+            try:
+                control = self._agents[scene].run_step(self._agent_input(view, row), float(view.time[row]))
+            finally:
+                CarlaDataProvider.enter(None)
             controls[row] = control.throttle, control.brake, -control.steer, bool(getattr(control, "reverse", False))
             if getattr(control, "hand_brake", False):
                 controls[row, :2] = 0.0, 1.0
@@ -240,9 +232,10 @@ class Leaderboard:
                 returns = view.readings[specification["id"]][row]
                 value = returns[returns[:, 0] > 0.0]
             elif sensor_type == "sensor.other.gnss":
-                value = np.array(geolocation(float(view.pose[row, 0]), float(view.pose[row, 1])))
+                noise = self._noise(view, row, GNSS_NOISE, "gnss")
+                value = np.array(_position(specification, view.pose[row])) + noise
             elif sensor_type == "sensor.other.imu":
-                value = self._imu(view, row, yaw)
+                value = self._imu(view, row, yaw) + self._noise(view, row, IMU_NOISE, "imu")
             elif sensor_type == "sensor.speedometer":
                 value = {"speed": float(view.speed[row])}
             else:
@@ -250,6 +243,12 @@ class Leaderboard:
             readings[str(specification["id"])] = (step, value)
         self._last_headings[int(view.scene[row])] = (time, yaw)
         return readings
+
+    def _noise(self, view: Observation, row: int, deviations: Sequence[float], sensor: str) -> F64:
+        """Return the noise of a reading, which depends on the episode and the time alone."""
+        episode, step = self._episodes[int(view.scene[row])], round(float(view.time[row]) / STEP)
+        random = generator("leaderboard noise", sensor, episode.key, episode.seed, step)
+        return np.asarray(deviations) * random.standard_normal(len(deviations))
 
     def _imu(self, view: Observation, row: int, yaw: float) -> F64:
         """Return accelerations and rates [6], and the compass: clockwise from north, rad."""
@@ -261,85 +260,45 @@ class Leaderboard:
         return np.array([float(view.accel[row]), lateral, GRAVITY, 0.0, 0.0, -yaw_rate, compass])
 
 
+def _position(specification: Mapping[str, Any], pose: F32) -> tuple[float, float, float]:
+    """Return latitude and longitude, degrees, and altitude, m, of a sensor on a car with this pose."""
+    x, y, yaw = (float(value) for value in pose)
+    ahead, right, z = (number(specification, key, 0.0, -100.0, 100.0) for key in ("x", "y", "z"))
+    east = x + ahead * math.cos(yaw) + right * math.sin(yaw)
+    north = y + ahead * math.sin(yaw) - right * math.cos(yaw)
+    latitude, longitude, _ = geolocation(east, north)
+    return latitude, longitude, z
+
+
+def _networks(root: Any) -> list[Any]:
+    """Return the networks (`torch.nn.Module`) that an agent holds, in attributes, lists and mappings at any depth."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return []
+    networks, visited, waiting = [], set(), [root]
+    while waiting:
+        value = waiting.pop()
+        if id(value) in visited:
+            continue
+        visited.add(id(value))
+        if isinstance(value, torch.nn.Module):
+            networks.append(value)
+        elif isinstance(value, Mapping):
+            waiting.extend(value.values())
+        elif isinstance(value, list | tuple | set):
+            waiting.extend(value)
+        elif not isinstance(value, type) and hasattr(value, "__dict__"):
+            waiting.extend(vars(value).values())
+    return networks
+
+
 def _global_plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
     """Return the plan of a route, a point per metre: geographic and as CARLA's transforms, with `RoadOption`."""
-    import carla
-
-    in_junction = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
-    options = np.full(len(route.xy), int(RoadOption.LANEFOLLOW))
-    entries = np.flatnonzero(in_junction & ~np.concatenate([[False], in_junction[:-1]]))
-    for entry in entries.tolist():
-        exits = np.flatnonzero(~in_junction[entry:])
-        exit_index = entry + int(exits[0]) if len(exits) else len(in_junction) - 1
-        turn = float(wrap_angle(float(route.yaw[exit_index] - route.yaw[entry])))
-        command = RoadOption.LEFT if turn > TURN else RoadOption.RIGHT if turn < -TURN else RoadOption.STRAIGHT
-        options[entry : exit_index + 1] = int(command)
+    command_type = sys.modules[OPTIONS].RoadOption
+    commands = [command_type(option) for option in road_options(route, graph).tolist()]
     gps_plan, world_plan = [], []
-    for (x, y), yaw, option in zip(route.xy.tolist(), route.yaw.tolist(), options.tolist(), strict=True):
+    for (x, y), yaw, command in zip(route.xy.tolist(), route.yaw.tolist(), commands, strict=True):
         latitude, longitude, z = geolocation(x, y)
-        gps_plan.append(({"lat": latitude, "lon": longitude, "z": z}, _road_option(option)))
-        transform = carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(yaw)))
-        world_plan.append((transform, _road_option(option)))
+        gps_plan.append(({"lat": latitude, "lon": longitude, "z": z}, command))
+        world_plan.append((transform_of(x, y, yaw, z), command))
     return gps_plan, world_plan
-
-
-def _road_option(value: int) -> Any:
-    return sys.modules["agents.navigation.local_planner"].RoadOption(value)
-
-
-def _install_stand_ins() -> None:
-    """Put our few names where packages that agents import are not installed."""
-
-    def offer(name: str, **content: Any) -> None:
-        parts = name.split(".")
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            for k in range(1, len(parts) + 1):
-                module = sys.modules.setdefault(".".join(parts[:k]), types.ModuleType(".".join(parts[:k])))
-                if k > 1:
-                    setattr(sys.modules[".".join(parts[: k - 1])], parts[k - 1], module)
-            vars(sys.modules[name]).update(content)
-
-    offer("leaderboard.autoagents.autonomous_agent", AutonomousAgent=AutonomousAgent, Track=Track)
-    offer("agents.navigation.local_planner", RoadOption=RoadOption)
-    offer("carla", **{kind.__name__: kind for kind in (VehicleControl, Location, Rotation, Transform)})
-
-
-class VehicleControl:
-    """Control command of an agent where `carla` is not installed."""
-
-    def __init__(  # noqa: PLR0917
-        self,
-        throttle: float = 0.0,
-        steer: float = 0.0,
-        brake: float = 0.0,
-        hand_brake: bool = False,
-        reverse: bool = False,
-        manual_gear_shift: bool = False,
-        gear: int = 0,
-    ) -> None:
-        self.throttle, self.steer, self.brake = throttle, steer, brake
-        self.hand_brake, self.reverse = hand_brake, reverse
-        self.manual_gear_shift, self.gear = manual_gear_shift, gear
-
-
-class Location:
-    """Position in CARLA's frame where `carla` is not installed."""
-
-    def __init__(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
-        self.x, self.y, self.z = x, y, z
-
-
-class Rotation:
-    """Rotation in CARLA's frame, degrees, where `carla` is not installed."""
-
-    def __init__(self, pitch: float = 0.0, yaw: float = 0.0, roll: float = 0.0) -> None:
-        self.pitch, self.yaw, self.roll = pitch, yaw, roll
-
-
-class Transform:
-    """Position and rotation where `carla` is not installed."""
-
-    def __init__(self, location: Location | None = None, rotation: Rotation | None = None) -> None:
-        self.location, self.rotation = location or Location(), rotation or Rotation()

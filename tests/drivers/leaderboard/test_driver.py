@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,13 @@ from helpers.command import ssad
 
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
+from ssad.core.traces import first_difference
 from ssad.core.types import Actor, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
-from ssad.drivers.leaderboard import Leaderboard, RoadOption, _global_plan, geolocation
+from ssad.drivers.leaderboard import Leaderboard
+from ssad.drivers.leaderboard.carla_types import RoadOption
+from ssad.drivers.leaderboard.driver import _global_plan
+from ssad.drivers.leaderboard.sensors import geolocation
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.simulators.closed_loop import onboard_sensors
 from ssad.world.roads import load_town
@@ -120,7 +125,7 @@ def test_the_command_drives_it(agent: Path, tmp_path: Path) -> None:
 def _view(yaw: float, time: float, speed: float) -> Observation:
     one = np.ones(1, np.float32)
     pose = np.array([[30.0, 40.0, yaw]], np.float32)
-    rest = dict.fromkeys(("route", "lane_offset", "heading_error", "others", "others_lane", "signal"))
+    rest = dict.fromkeys(("route", "lane_offset", "heading_error", "others_lane"))
     return Observation(
         scene=np.zeros(1, np.int32),
         agent=np.zeros(1, np.int32),
@@ -130,6 +135,8 @@ def _view(yaw: float, time: float, speed: float) -> Observation:
         pose=pose,
         target_speed=one * 8,
         done=np.zeros(1, bool),
+        others=np.zeros((1, 16, 7), np.float32),
+        signal=np.array([[0.0, 1e6]], np.float32),
         readings={"front": np.arange(12, dtype=np.uint8).reshape(1, 3, 2, 2)},
         **rest,
     )
@@ -160,12 +167,12 @@ def test_what_an_agent_is_told(tmp_path: Path) -> None:
     assert driver.act(_view(0.1, 1.1, 5.0)).tolist() == [[0.25, 0.125, -0.5, 0.0]]
     data, timestamp = driver._agents[0].seen
     assert timestamp == pytest.approx(1.1)
-    assert {key: value[0] for key, value in data.items()} == dict.fromkeys(data, 11)
+    assert {key: value[0] for key, value in data.items()} == dict.fromkeys(data, 22)  # 20 Hz
     assert data["front"][1].shape == (2, 2, 4)
     assert data["front"][1][0, 0].tolist() == [8, 4, 0, 255]
-    assert data["gnss"][1] == pytest.approx(geolocation(30.0, 40.0), abs=1e-12)
+    assert data["gnss"][1] == pytest.approx(geolocation(30.0, 40.0), abs=5e-5)  # ten standard deviations
     imu = data["imu"][1]
-    assert imu[5] == pytest.approx(-1.0, abs=1e-4)  # to the left is against the clock
+    assert imu[5] == pytest.approx(-1.0, abs=1e-2)  # to the left is against the clock
     assert imu[6] == pytest.approx(math.pi / 2 - 0.1, abs=1e-6)  # east is a quarter turn from north
     assert "<OpenDRIVE>" in data["opendrive_map"][1]["opendrive"]
     eye = driver.cameras["front"]
@@ -175,6 +182,241 @@ def test_what_an_agent_is_told(tmp_path: Path) -> None:
     episode = build_episode(turn, load_town(turn.town), seed=0)
     told = {int(option) for _, option in _global_plan(episode.agents[0].route, load_town(turn.town))[1]}
     assert told == {int(RoadOption.LEFT), int(RoadOption.LANEFOLLOW)}
+
+
+def _readings(driver: Leaderboard, key: str = "") -> np.ndarray:
+    """GNSS and IMU [400, 10] of an ego that drives straight on at 5 m/s, east."""
+    scenario = load_scenarios("StraightObstacle/00")[0]
+    episode = build_episode(scenario, load_town(scenario.town), seed=0)
+    driver.reset([replace(episode, key=key or episode.key)])
+    rows = []
+    for step in range(400):
+        driver.act(_view(0.0, 0.05 * step, 5.0))
+        data = driver._agents[0].seen[0]
+        rows.append(np.concatenate([data["gnss"][1], data["imu"][1]]))
+    return np.array(rows)
+
+
+def test_gnss_and_imu_have_the_noise_of_the_leaderboard(tmp_path: Path) -> None:
+    """Source: agent_wrapper.py of leaderboard 1.0 to 2.1."""
+    path = tmp_path / "noise.py"
+    step = "def run_step(self, input_data, timestamp):\n        "
+    path.write_text(AGENT.replace(step, step + "self.seen = input_data, timestamp\n        "))
+    rows = _readings(Leaderboard(str(path)))
+    expected = np.array([5e-6, 5e-6, 5e-6, 1e-3, 1e-3, 1.5e-2, 1e-3, 1e-3, 1e-3])
+    assert rows[:, :9].std(0) == pytest.approx(expected, rel=0.2)
+    mean = [*geolocation(30.0, 40.0), 0.5, 0.0, 9.81, 0.0, 0.0, 0.0]
+    assert (np.abs(rows[:, :9].mean(0) - mean) < 0.25 * expected).all(), "five standard errors"
+    assert rows[:, 9].std() == 0.0, "the compass is exact"
+    assert np.array_equal(_readings(Leaderboard(str(path))), rows), "the same episode, the same noise"
+    assert not np.array_equal(_readings(Leaderboard(str(path)), "another")[:, :9], rows[:, :9])
+
+
+def test_gnss_is_where_it_is_mounted(tmp_path: Path) -> None:
+    path = tmp_path / "mounted.py"
+    step = "def run_step(self, input_data, timestamp):\n        "
+    text = AGENT.replace(step, step + "self.seen = input_data, timestamp\n        ")
+    path.write_text(
+        text.replace('"id": kind.split(".")[-1]}', '"id": kind.split(".")[-1], "x": -1.4, "y": 0.5, "z": 2}')
+    )
+    rows = _readings(Leaderboard(str(path)))
+    assert rows[:, :2].mean(0) == pytest.approx(geolocation(28.6, 39.5)[:2], abs=2e-6)
+    assert rows[:, 2].mean() == pytest.approx(2.0, abs=1e-3)
+
+
+# imports what agents import of scenario_runner, and asks it while it drives
+SRUNNER = """
+import carla
+from leaderboard.autoagents import autonomous_agent
+from srunner.scenariomanager.carla_data_provider import CarlaDataProvider
+from srunner.scenariomanager.timer import GameTime
+
+
+def get_entry_point():
+    return "A"
+
+
+class A(autonomous_agent.AutonomousAgent):
+    def setup(self, path):
+        self.track = autonomous_agent.Track.SENSORS
+        self.facts = []
+
+    def sensors(self):
+        return [dict(type="sensor.speedometer", reading_frequency=20, id="s")]
+
+    def run_step(self, data, timestamp):
+        hero = CarlaDataProvider.get_hero_actor()
+        vehicles = CarlaDataProvider.get_world().get_actors().filter("vehicle.*")
+        waypoint = CarlaDataProvider.get_map().get_waypoint(hero.get_location())
+        self.facts.append((hero, waypoint, vehicles, GameTime.get_time(), timestamp))
+        return carla.VehicleControl(throttle=0.3)
+"""
+
+
+def test_an_agent_asks_scenario_runner(tmp_path: Path) -> None:
+    """The ego, the agents near it, the lane under it and the time, in CARLA's frame, each agent of its own scene."""
+    path = tmp_path / "agent.py"
+    path.write_text(SRUNNER)
+    episodes = [build_episode(load_scenarios(name)[0], load_town("ProvingGround"), seed=0) for name in LEFT_AND_AHEAD]
+    episodes = [replace(episode, limits=replace(episode.limits, max_steps=25)) for episode in episodes]
+    driver = make_system(f"leaderboard:{path}")
+    traces = rollout(World(episodes, {"ProvingGround": load_town("ProvingGround")}), driver)
+    for trace, agent in zip(traces, driver.act.__self__._agents, strict=True):
+        hero, waypoint, vehicles, time, timestamp = agent.facts[20]
+        x, y, yaw = (float(values[20, 0]) for values in (trace.x, trace.y, trace.yaw))
+        location, rotation = hero.get_location(), hero.get_transform().rotation
+        assert (location.x, location.y) == pytest.approx((x, -y), abs=1e-4)
+        assert rotation.yaw == pytest.approx(-math.degrees(yaw), abs=1e-3)
+        speed = float(trace.speed[20, 0])
+        assert hero.get_velocity().x == pytest.approx(speed * math.cos(yaw), abs=1e-3)
+        assert hero.get_velocity().y == pytest.approx(-speed * math.sin(yaw), abs=1e-3)
+        assert waypoint.transform.location.distance(location) < 0.5
+        assert waypoint.lane_width > 3.0
+        assert time == timestamp == pytest.approx(2.0)
+        others = {(round(float(trace.x[20, k]), 2), round(-float(trace.y[20, k]), 2)) for k in range(len(trace.names))}
+        asked = {(round(actor.get_location().x, 2), round(actor.get_location().y, 2)) for actor in vehicles}
+        assert asked <= others
+        assert vehicles.find(1) is hero
+
+
+LEFT_AND_AHEAD = ("UnprotectedLeftTurn/00", "StraightObstacle/00")
+
+# the leaderboard's own example: a BasicAgent along the plan
+NPC = """
+import carla
+from agents.navigation.basic_agent import BasicAgent
+from leaderboard.autoagents.autonomous_agent import AutonomousAgent, Track
+from srunner.scenariomanager.carla_data_provider import CarlaDataProvider
+
+
+def get_entry_point():
+    return "Npc"
+
+
+class Npc(AutonomousAgent):
+    def setup(self, path_to_conf_file):
+        self.track, self.agent, self.red = Track.SENSORS, None, []
+
+    def sensors(self):
+        return [{"type": "sensor.speedometer", "id": "speed"}]
+
+    def run_step(self, input_data, timestamp):
+        if self.agent is None:
+            for actor in CarlaDataProvider.get_world().get_actors():
+                if actor.attributes.get("role_name") == "hero":
+                    self.agent = BasicAgent(actor, 20)
+            plan, previous = [], None
+            for transform, _ in self._global_plan_world_coord:
+                waypoint = CarlaDataProvider.get_map().get_waypoint(transform.location)
+                if previous:
+                    plan.extend(self.agent.trace_route(previous, waypoint))
+                previous = waypoint
+            self.agent.set_global_plan(plan)
+        return self.agent.run_step()
+"""
+
+
+def test_a_basic_agent_drives_the_plan(tmp_path: Path) -> None:
+    """It keeps to the route through turns at 20 km/h, stops at a red light and behind what stands in its lane."""
+    path = tmp_path / "npc.py"
+    path.write_text(NPC)
+    names = ("UnprotectedLeftTurn/00", "LaneChanging/00", "RightTurn/00")
+    town = load_town("ProvingGround")
+    routes = [build_episode(load_scenarios(name)[0], town, seed=0) for name in names]
+    alone = [replace(episode, agents=episode.agents[:1]) for episode in routes]
+    parked = Actor("parked", "van", Pose(249.0, -5.25, 0.0))
+    route = (Pose(217.0, -5.25), Pose(300.0, -5.25))
+    blocked = Scenario("blocked", "Custom", town.name, route, actors=(parked,), limits=EpisodeLimits(max_steps=200))
+    episodes = [*alone, build_episode(blocked, town, seed=0)]
+    *free, red, waits = rollout(World(episodes, {town.name: town}), make_system(f"leaderboard:{path}"))
+    for trace in free:
+        assert trace.end in ("complete", "max_distance"), trace.key
+        assert trace.route_distance.max() < 1.5, trace.key
+        assert not trace.off_road.any(), trace.key
+        assert 4.5 < trace.speed[:, 0].max() < 6.5
+    assert red.end == "max_steps"
+    assert red.speed[-1, 0] < 0.1
+    assert not red.red_light.any()
+    assert not waits.contact.any()
+    assert waits.speed[-1, 0] < 0.1
+    assert 1.0 < 249.0 - 0.5 * waits.length[1] - waits.x[-1, 0] - 0.5 * waits.length[0] < 10.0
+
+
+NETWORK = """
+import carla
+import torch
+from leaderboard.autoagents.autonomous_agent import AutonomousAgent, Track
+
+LOADED = []
+
+
+def get_entry_point():
+    return "Network"
+
+
+class Network(AutonomousAgent):
+    def setup(self, path_to_conf_file):
+        LOADED.append(1)
+        self.track, self.steps, self.parts = Track.SENSORS, [], {"net": torch.nn.Linear(1, 1)}
+        torch.nn.init.constant_(self.parts["net"].weight, 0.1)
+        torch.nn.init.constant_(self.parts["net"].bias, 0.2)
+
+    def sensors(self):
+        return [{"type": "sensor.speedometer", "id": "speed"}]
+
+    def run_step(self, input_data, timestamp):
+        speed = input_data["speed"][1]["speed"]
+        self.steps.append(timestamp)
+        throttle = float(self.parts["net"](torch.tensor([speed])).detach())
+        return carla.VehicleControl(throttle=throttle * (len(self.steps) > 3))
+"""
+
+
+def test_a_batch_shares_its_networks(tmp_path: Path) -> None:
+    """`share=true`: one setup and one network for all episodes, but a state of its own for each."""
+    pytest.importorskip("torch")
+    path = tmp_path / "network.py"
+    path.write_text(NETWORK)
+    town = load_town("ProvingGround")
+    episodes = [build_episode(load_scenarios(name)[0], town, seed=0) for name in (*LEFT_AND_AHEAD, "RightTurn/00")]
+    episodes = [replace(episode, limits=replace(episode.limits, max_steps=20)) for episode in episodes]
+    plain, shared = make_system(f"leaderboard:{path}"), make_system(f"leaderboard:{path}?share=true@shared")
+    assert shared.name == "shared"
+    loaded = plain.act.__self__._agent_class.setup.__globals__["LOADED"]
+    traces = rollout(World(episodes, {town.name: town}), plain)
+    assert len(loaded) >= len(episodes)
+    loaded = shared.act.__self__._agent_class.setup.__globals__["LOADED"]
+    count = len(loaded)
+    for trace, other in zip(traces, rollout(World(episodes, {town.name: town}), shared), strict=True):
+        assert first_difference(trace, other) is None
+    assert len(loaded) == count, "no further setup"
+    agents = shared.act.__self__._agents
+    assert len({id(agent.parts["net"]) for agent in agents}) == 1
+    assert len({id(agent.steps) for agent in agents}) == 3
+    assert all(len(agent.steps) == 20 for agent in agents)
+    assert agents[0]._global_plan != agents[1]._global_plan
+    with pytest.raises(ConfigError, match="share is true or false, not 3"):
+        make_system(f"leaderboard:{path}?share=3")
+    with pytest.raises(ConfigError, match="unexpected keyword argument 'shared'"):
+        make_system(f"leaderboard:{path}?shared=true")
+    path.write_text(
+        NETWORK.replace(
+            "self.steps, self.parts = Track.SENSORS, [],", "self.steps, self.parts, self.lock = Track.SENSORS, [],"
+        ).replace("Linear(1, 1)}", 'Linear(1, 1)}, __import__("threading").Lock()')
+    )
+    with pytest.raises(ConfigError, match=r"share=true: it cannot be copied: TypeError.*leave share out"):
+        make_system(f"leaderboard:{path}?share=true").reset(episodes[:1])
+
+
+def test_the_plan_is_there_in_setup(tmp_path: Path) -> None:
+    """As in the leaderboard, which gives the plan before it sets an agent up."""
+    path = tmp_path / "agent.py"
+    line = "self.track, self.speed, self.at = Track.SENSORS, 6.0, 0"
+    path.write_text(AGENT.replace(line, line + "; self.early = len(getattr(self, 'plan', []))"))
+    driver = Leaderboard(str(path))
+    scenario = load_scenarios("StraightObstacle/00")[0]
+    driver.reset([build_episode(scenario, load_town(scenario.town), seed=0)])
+    assert driver._agents[0].early == len(driver._agents[0].plan) > 50
 
 
 def test_lidar_and_radar(tmp_path: Path) -> None:
@@ -272,7 +514,7 @@ def test_what_is_no_agent_is_refused_in_a_line(name: str, tmp_path: Path) -> Non
 
 def test_it_drives_where_nothing_of_carla_is_installed(agent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(sys.modules):
-        if name.partition(".")[0] in ("carla", "leaderboard", "agents"):
+        if name.partition(".")[0] in ("carla", "leaderboard", "agents", "srunner"):
             monkeypatch.delitem(sys.modules, name)
     real = __import__("importlib").import_module
 
@@ -285,6 +527,6 @@ def test_it_drives_where_nothing_of_carla_is_installed(agent: Path, monkeypatch:
     driver = Leaderboard(str(agent))
     scenario = load_scenarios("StraightObstacle/00")[0]
     driver.reset([build_episode(scenario, load_town(scenario.town), seed=0)])
-    assert sys.modules["carla"].VehicleControl.__module__ == "ssad.drivers.leaderboard"
-    for name in ("carla", "leaderboard", "agents"):
+    assert sys.modules["carla"].VehicleControl.__module__ == "ssad.drivers.leaderboard.carla_types"
+    for name in ("carla", "leaderboard", "agents", "srunner"):
         monkeypatch.delitem(sys.modules, name, raising=False)
