@@ -113,6 +113,26 @@ def test_file_round_trip_is_exact_and_deterministic(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
+def test_rule_of_the_road_and_origin_are_stored_where_they_are_not_the_usual(tmp_path: Path) -> None:
+    graph = load_town("Twinford")
+    assert (graph.forward == (graph.lane_id < 0)).all()
+    assert (graph.left_hand.tolist(), graph.turn_on_red.tolist(), graph.origin.tolist()) == (
+        [False],
+        [True],
+        [0.0, 0.0],
+    )
+    changed = {"forward": graph.lane_id > 0, "left_hand": [True], "turn_on_red": [False], "origin": [5e5 + 0.25, 5e6]}
+    save_graph(LaneGraph(**(parts(graph) | changed)), tmp_path / "left.npz")
+    again = load_graph(tmp_path / "left.npz")
+    for name, value in changed.items():
+        assert np.array_equal(getattr(again, name), value), name
+    save_graph(graph, tmp_path / "right.npz")
+    with np.load(tmp_path / "right.npz") as data:
+        assert not set(changed) & set(data.files)
+    with pytest.raises(MapError, match="origin does not have 2 rows"):
+        LaneGraph(**(parts(graph) | {"origin": [1.0]}))
+
+
 def test_a_file_from_before_there_were_signs_has_none(tmp_path: Path) -> None:
     graph = load_town("Twinford")
     assert len(graph.sign_kind) > 0

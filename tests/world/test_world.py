@@ -358,6 +358,35 @@ def test_no_model_is_longer_than_the_autopilot_reckons_with() -> None:
     assert max(m.length for m in MODELS.values()) / 2 <= float(LONGEST)
 
 
+def test_where_turns_on_red_are_forbidden_the_autopilot_waits_and_a_turn_counts_as_run() -> None:
+    scenario = load_scenarios("RightTurn/00")[0]
+    town = load_town(scenario.town)
+    one = build_episode(scenario, town, seed=0)
+    alone = replace(one, agents=one.agents[:1])
+    towns = {allowed: replace(town, turn_on_red=np.array([allowed])) for allowed in (True, False)}
+    worlds = {
+        allowed: World([alone], {scenario.town: graph}, ego=Controller.AUTOPILOT) for allowed, graph in towns.items()
+    }
+    while not worlds[True].ended()[0]:
+        for world in worlds.values():
+            world.step()
+    assert not worlds[False].ended()[0]
+    assert worlds[False].array("speed")[0, 0] < 0.1
+    travelled = worlds[False].array("travelled")[0, 0]
+    # Forbidden once the ego has begun to turn: its tail crosses the line on red.
+    world = World([alone], {scenario.town: town}, ego=Controller.AUTOPILOT)
+    counted = 0
+    while not world.ended()[0]:
+        world.step()
+        counted += int(world.array("ego.red_light")[0] == 1)
+        if world.array("travelled")[0, 0] > travelled + 2.0:
+            grid = world.bank.roads.grid
+            values = grid.numpy()
+            values[:, 3] = 0.0
+            grid.assign(values)
+    assert counted == 1
+
+
 @pytest.mark.parametrize(("system", "runs"), [(Controller.AUTOPILOT, 0), (Controller.FOLLOW, 1)])
 def test_right_turn_on_red_counts_as_run_only_without_a_stop(system: Controller, runs: int) -> None:
     scenario = load_scenarios("RightTurn/00")[0]

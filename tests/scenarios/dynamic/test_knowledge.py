@@ -11,6 +11,7 @@ import pytest
 
 from ssad.core.errors import ConfigError, RouteError
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import (
     Actor,
     Controller,
@@ -24,8 +25,17 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
-from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, Parameter, ScenarioType, parameter_box, scenario_type
-from ssad.scenarios.dynamic.episode import forced_signals
+from ssad.scenarios.dynamic import (
+    PRECRASH,
+    SCENARIOS,
+    Parameter,
+    ScenarioType,
+    build_episode,
+    load_scenarios,
+    parameter_box,
+    scenario_type,
+)
+from ssad.scenarios.dynamic.episode import forced_signals, near_side_turns
 from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, ONCOMING
 from ssad.scenarios.dynamic.knowledge._meeting import ego_times, meeting_place, time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
@@ -48,6 +58,7 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     width_at,
 )
 from ssad.world.models import model
+from ssad.world.roads import load_town, route_along
 
 from .conftest import lane_of
 
@@ -215,6 +226,53 @@ def test_signals_of_the_ego_and_of_the_others(crossroads: LaneGraph, routes: Any
     assert forced_signals(crossroads, routes.straight, green_plan, whole_town=True) == {}
     real = replace(crossroads, signal_virtual=np.zeros(4, bool))
     assert set(forced_signals(real, routes.straight, green_plan, whole_town=True).values()) == {green}
+
+
+def test_red_is_forced_only_where_the_ego_turns_to_the_near_side() -> None:
+    """A route of Twinford that goes straight on at one junction and turns right at the next."""
+    graph = load_town("Twinford")
+    turns = {}
+    for lane in np.flatnonzero((graph.junction >= 0) & (graph.kind == LaneType.DRIVING)).tolist():
+        part = graph.points(lane)
+        turns[lane] = float(wrap_angle(graph.yaw[part.stop - 1] - graph.yaw[part.start]))
+    route = next(
+        candidate
+        for straight, angle in turns.items()
+        if abs(angle) < 0.2
+        for between in graph.successors(straight).tolist()
+        for right in graph.successors(between).tolist()
+        if turns.get(right, 0.0) < -1.0 and graph.junction[right] != graph.junction[straight]
+        for candidate in [
+            route_along(
+                graph,
+                [
+                    Pose(*graph.at(int(graph.predecessors(straight)[0]), 5.0)[:3]),
+                    Pose(*graph.at(between, 0.5 * float(graph.length[between]))[:3]),
+                    Pose(*graph.at(int(graph.successors(right)[0]), 5.0)[:3]),
+                ],
+            )
+        ]
+    )
+    on_route = np.unique(graph.junction[route.lane[route.lane >= 0]])
+    turned_at = near_side_turns(graph, route)
+    assert len(turned_at) == 1
+    assert len(on_route[on_route >= 0]) == 2
+    plan = SignalPlan("red", "green")
+    states = forced_signals(graph, route, plan)
+    assert {int(graph.signal_junction[signal]) for signal in states} == turned_at
+    assert sorted(set(states.values())) == sorted({SignalState.RED, SignalState.GREEN})
+    mirrored = replace(graph, left_hand=np.array([True]))
+    assert near_side_turns(mirrored, route) == set()
+    assert {int(graph.signal_junction[s]) for s in forced_signals(mirrored, route, plan)} == set(on_route.tolist()) - {
+        -1
+    }
+
+
+def test_a_town_that_forbids_turns_on_red_has_no_right_turn_on_red() -> None:
+    scenario = load_scenarios("RightTurn/00")[0]
+    town = replace(load_town(scenario.town), turn_on_red=np.array([False]))
+    with pytest.raises(RouteError, match="turns on red, which town"):
+        build_episode(scenario, town, seed=0)
 
 
 def test_custom_actors_are_taken_as_written(crossroads: LaneGraph, routes: Any) -> None:

@@ -208,6 +208,12 @@ BAD = {
     "no section": (ROAD.replace("laneSection", "section"), "no <laneSection>"),
     "id": (ROAD.replace('id="-1"', 'id="one"'), "<lane id='one'> is not a whole number"),
     "no id": (ROAD.replace('road id="1"', "road"), "a road has no attribute 'id'"),
+    "lanes": (
+        ROAD.replace('length="10"', 'length="90000"').replace(
+            "</right>", "".join(f'<lane id="-{n}" type="none"/>' for n in range(2, 60)) + "</right>"
+        ),
+        "m of lanes, the limit is",
+    ),
     "turns": (ROAD.replace("<line/>", '<arc curvature="1e6"/>'), "turns by more than 200 rad"),
     "apart": (
         ROAD.replace(

@@ -30,6 +30,7 @@ JOIN_MARGIN = 0.1  # m beyond half the width of a lane across which one that wou
 WIDE = 100.0  # m; a wider lane is a mistake
 BESIDE = 0.5  # m between the end of a lane and an unlinked start that is worth a word
 SAME_WAY = 0.7  # cosine between two lanes of the same direction
+MAX_LANE_METRES = 5.0e6  # of all lanes: bounds the memory of the reader
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
 
 Progress = Callable[[str], None]
@@ -71,10 +72,17 @@ def bake(
         for index, section in enumerate(road.sections)
         for lane in sorted(section.lanes)
     ]
+    metres = sum(
+        (section.s1 - section.s0) * len(section.lanes) for road in network.roads.values() for section in road.sections
+    )
+    if metres > MAX_LANE_METRES:
+        raise MapError(f"{path}: {metres:.0f} m of lanes, the limit is {MAX_LANE_METRES:.0f} m; divide the map")
     stage(f"evaluating {len(keys)} lanes of {len(network.roads)} roads")
-    sampler = LaneSampler(network)
-    sampler.check(account)
-    shapes = _shapes(network, keys, sampler.lanes(keys), account)
+    # Absurd coefficients overflow; lanes without a finite shape are left out below.
+    with np.errstate(all="ignore"):
+        sampler = LaneSampler(network)
+        sampler.check(account)
+        shapes = _shapes(network, keys, sampler.lanes(keys), account)
     if not any(_lane(network, key).kind == LaneType.DRIVING for key in shapes):
         raise MapError(f"{path}: no drivable lane in it has an area; correct the map and import it again")
     stage("linking lanes, placing signals")
