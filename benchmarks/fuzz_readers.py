@@ -602,22 +602,61 @@ def _read_points(folder: Path) -> object:
     return read_points(folder / "a.bin")
 
 
+def _clouds(folder: Path) -> Sequence[Path]:
+    """Write a PCD and a PLY of each encoding."""
+    from ssad.datasets.point_files import PointFile, encode_points_like
+
+    points = np.random.default_rng(0).integers(2, 30, (20, 5)).astype("<f4")
+    columns = tuple((name, np.dtype("<f4")) for name in ("x", "y", "z", "intensity", "ring"))
+    for suffix in ("pcd", "ply"):
+        for is_text in (True, False):
+            content = encode_points_like(PointFile(points, suffix, is_text, columns), points)
+            (folder / f"{is_text}.{suffix}").write_bytes(content)
+    values = points.T.tobytes()
+    runs = [values[start : start + 32] for start in range(0, len(values), 32)]
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    header, _ = (folder / "False.pcd").read_bytes().split(b"binary\n", 1)
+    lengths = np.array([len(packed), len(values)], "<u4").tobytes()
+    (folder / "packed.pcd").write_bytes(header + b"binary_compressed\n" + lengths + packed)
+    return sorted(folder.iterdir())
+
+
+def _read_clouds(folder: Path) -> object:
+    from ssad.datasets.point_files import encode_points_like, read_point_file
+
+    problems = []
+    for path in sorted(folder.iterdir()):
+        try:
+            point_file = read_point_file(path)
+            encode_points_like(point_file, point_file.points)
+        except SSADError as error:
+            problems.append(check_line(error))
+    return problems
+
+
 def _images(folder: Path) -> Sequence[Path]:
     from PIL import Image
 
     pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
     for name in ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif"):
         Image.fromarray(pixels).save(folder / name)
+    Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "f.tif")
+    Image.fromarray(pixels).convert("CMYK").save(folder / "g.jpg")
+    Image.fromarray(pixels[..., 0]).save(folder / "h.pgm")
     return sorted(folder.iterdir())
 
 
 def _read_images(folder: Path) -> object:
-    from ssad.core.images import read_image
+    from ssad.core.image_files import encode_like, read_image_file
     from ssad.detectors.images import as_images
+
+    def write_anew(path: Path) -> bytes:
+        image_file = read_image_file(path)
+        return encode_like(image_file, image_file.rgb)
 
     problems = []
     for path in sorted(folder.iterdir()):
-        for read in (read_image, as_images):
+        for read in (write_anew, as_images):
             try:
                 read(path)
             except SSADError as error:
@@ -691,6 +730,7 @@ READERS: dict[str, Reader] = {
     "results": Reader(_results, _read_results),
     "coco": Reader(_coco, _read_coco),
     "points": Reader(_points, _read_points),
+    "clouds": Reader(_clouds, _read_clouds),
     "images": Reader(_images, _read_images),
     "obj": Reader(_mesh, _read_mesh),
     "gltf": Reader(_gltf, _read_gltf),
