@@ -81,10 +81,12 @@ class Reader:
     Attributes:
         make: Writes valid files into an empty folder and returns those that are mutated, by path.
         read: Reads the files of the folder.
+        is_single: Whether each file stands alone, so that the others need not be read again.
     """
 
     make: Callable[[Path], Sequence[Path]]
     read: Callable[[Path], object]
+    is_single: bool = False
 
 
 @dataclass
@@ -326,17 +328,48 @@ def mutate(draw: random.Random, path: Path, content: bytes) -> bytes:
 # ---------------------------------------------------------------- readers
 
 
-def _town(folder: Path) -> Sequence[Path]:
-    from ssad.world.roads import town_xodr
+MAP = """<OpenDRIVE><header revMajor="1" revMinor="6"><geoReference>+proj=tmerc +lat_0=0 +lon_0=0</geoReference>
+<offset x="5" y="5" z="0" hdg="0"/></header>
+<road id="1" length="100" junction="-1" rule="RHT"><link><successor elementType="road" elementId="2"
+contactPoint="start"/></link><type s="0" type="town"><speed max="50" unit="km/h"/></type><planView>
+<geometry s="0" x="0" y="0" hdg="0" length="40"><line/></geometry>
+<geometry s="40" x="40" y="0" hdg="0" length="20"><spiral curvStart="0" curvEnd="0.01"/></geometry>
+<geometry s="60" x="60" y="0.7" hdg="0.1" length="40"><arc curvature="0.01"/></geometry></planView>
+<elevationProfile><elevation s="0" a="0" b="0.01" c="0" d="0"/></elevationProfile>
+<lateralProfile><superelevation s="0" a="0" b="0.001" c="0" d="0"/></lateralProfile>
+<lanes><laneOffset s="0" a="0" b="0" c="0" d="0"/><laneSection s="0"><left><lane id="1" type="driving"><width
+sOffset="0"
+a="3.5" b="0" c="0" d="0"/></lane></left><center><lane id="0" type="none"><roadMark sOffset="0" type="broken"
+color="white"/></lane></center><right><lane id="-1" type="driving"><link><successor id="-1"/></link><width sOffset="0"
+a="3.5" b="0" c="0" d="0"/><speed sOffset="0" max="13.9"/></lane><lane id="-2" type="sidewalk"><border
+sOffset="0" a="-5"
+b="0" c="0" d="0"/></lane></right></laneSection></lanes><objects><object id="7" type="crosswalk" s="50" t="0" hdg="0"
+length="4" width="7"><outline><cornerLocal u="-2" v="-3"/><cornerLocal u="2" v="-3"/><cornerLocal u="2"
+v="3"/></outline>
+</object></objects><signals><signal id="9" s="95" t="-4" type="1000001" subtype="-1" country="OpenDRIVE" dynamic="yes"
+orientation="+"><validity fromLane="-1" toLane="-1"/></signal><signal id="10" s="10" t="-4" type="274" subtype="-1"
+country="DE" value="30" unit="km/h" dynamic="no" orientation="+"/></signals></road>
+<road id="2" length="60" junction="-1"><link><predecessor elementType="road" elementId="1" contactPoint="end"/></link>
+<planView><geometry s="0" x="98" y="8" hdg="0.5" length="30"><paramPoly3 pRange="arcLength" aU="0" bU="1"
+cU="0" dU="0"
+aV="0" bV="0" cV="0.001" dV="0"/></geometry><geometry s="30" x="124" y="23" hdg="0.5" length="30"><poly3 a="0" b="0"
+c="0.001" d="0"/></geometry></planView><lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
+<lane id="-1" type="driving"><link><predecessor id="-1"/></link><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+</right></laneSection></lanes></road>
+<junction id="5" name="a"><connection id="0" incomingRoad="1" connectingRoad="2"
+contactPoint="start"><laneLink from="-1"
+to="-1"/></connection></junction><controller id="3"><control signalId="9" type="0"/></controller></OpenDRIVE>"""
 
-    (folder / "map.xodr").write_text(town_xodr("ProvingGround"))
+
+def _map(folder: Path) -> Sequence[Path]:
+    (folder / "map.xodr").write_text(MAP)
     return [folder / "map.xodr"]
 
 
 def _read_map(folder: Path) -> object:
-    from ssad.world.roads.xodr import read_network
+    from ssad.world.roads.bake import import_map
 
-    return read_network(folder / "map.xodr")
+    return import_map(folder / "map.xodr", "a", folder.with_name("home"))
 
 
 def _scenarios() -> Sequence[Any]:
@@ -482,6 +515,30 @@ def _read_report(folder: Path) -> object:
     return write_report(folder), check_artefacts(folder), summary(folder), report_markdown([folder])
 
 
+def _two_runs(folder: Path) -> Sequence[Path]:
+    paths = _unsealed_run(folder / "first")
+    _run(folder / "second")
+    return paths
+
+
+def _read_comparison(folder: Path) -> object:
+    from ssad.report.compare import write_comparison
+
+    return write_comparison([folder / "first", folder / "second"], folder / "out", [])
+
+
+def _drive(folder: Path) -> Sequence[Path]:
+    return _nuscenes(folder, samples=6)
+
+
+def _read_drive(folder: Path) -> object:
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.interchange.drive_log import scenario_of_drive
+
+    with NuScenes(folder) as data:
+        return scenario_of_drive(data, data.scenes()[0].name if data.scenes() else "none", town="a")
+
+
 def _trace(folder: Path) -> Sequence[Path]:
     from helpers.metric_traces import make_trace
 
@@ -541,10 +598,10 @@ def _read_checkpoint(folder: Path) -> object:
     return [load_weights(path) for path in sorted(folder.glob("*.pth"))]
 
 
-def _nuscenes(folder: Path) -> Sequence[Path]:
+def _nuscenes(folder: Path, *, samples: int = 2) -> Sequence[Path]:
     from helpers.tiny import make_tiny
 
-    make_tiny(folder, scenes=1, samples=2, size=(64, 36))
+    make_tiny(folder, scenes=1, samples=samples, size=(64, 36))
     return sorted(folder.glob("v1.0-*/*.json"))
 
 
@@ -591,58 +648,67 @@ def _read_coco(folder: Path) -> object:
 
 
 def _points(folder: Path) -> Sequence[Path]:
-    values = np.random.default_rng(0).normal(size=(50, 5)).astype("<f4")
-    (folder / "a.bin").write_bytes(values.tobytes())
-    return [folder / "a.bin"]
-
-
-def _read_points(folder: Path) -> object:
-    from ssad.datasets.nuscenes.files import read_points
-
-    return read_points(folder / "a.bin")
-
-
-def _clouds(folder: Path) -> Sequence[Path]:
-    """Write a PCD and a PLY of each encoding."""
-    from ssad.datasets.point_files import PointFile, encode_points_like
-
-    points = np.random.default_rng(0).integers(2, 30, (20, 5)).astype("<f4")
-    columns = tuple((name, np.dtype("<f4")) for name in ("x", "y", "z", "intensity", "ring"))
-    for suffix in ("pcd", "ply"):
-        for is_text in (True, False):
-            content = encode_points_like(PointFile(points, suffix, is_text, columns), points)
-            (folder / f"{is_text}.{suffix}").write_bytes(content)
-    values = points.T.tobytes()
-    runs = [values[start : start + 32] for start in range(0, len(values), 32)]
-    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
-    header, _ = (folder / "False.pcd").read_bytes().split(b"binary\n", 1)
-    lengths = np.array([len(packed), len(values)], "<u4").tobytes()
-    (folder / "packed.pcd").write_bytes(header + b"binary_compressed\n" + lengths + packed)
+    values = np.random.default_rng(0).uniform(size=(20, 5)).astype("<f4")
+    rows = "".join(f"{x:.3f} {y:.3f} {z:.3f} {intensity:.3f}\n" for x, y, z, intensity in values[:, :4])
+    pcd = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    pcd += "WIDTH 20\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 20\nDATA "
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    ply, packed = "ply\nformat ascii 1.0\nelement vertex 20\n", np.ascontiguousarray(values[:, :4]).tobytes()
+    # LZF with literal runs alone, of at most 32 bytes, of the columns one after another
+    columns = np.ascontiguousarray(values[:, :4].T).tobytes()
+    runs = [columns[start : start + 32] for start in range(0, len(columns), 32)]
+    lzf = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    sizes = b"".join(len(part).to_bytes(4, "little") for part in (lzf, columns))
+    contents = {
+        "a.bin": values.tobytes(),
+        "ascii.pcd": f"{pcd}ascii\n{rows}".encode(),
+        "binary.pcd": f"{pcd}binary\n".encode() + packed,
+        "packed.pcd": f"{pcd}binary_compressed\n".encode() + sizes + lzf,
+        "ascii.ply": f"{ply}{properties}end_header\n{rows}".encode(),
+        "binary.ply": f"ply\nformat binary_little_endian 1.0\nelement vertex 20\n{properties}end_header\n".encode()
+        + packed,
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
     return sorted(folder.iterdir())
 
 
-def _read_clouds(folder: Path) -> object:
+def _read_points(folder: Path) -> object:
     from ssad.datasets.point_files import encode_points_like, read_point_file
 
-    problems = []
+    def write_anew(path: Path) -> bytes:
+        point_file = read_point_file(path)
+        return encode_points_like(point_file, point_file.points)
+
+    return _read_each(folder, write_anew)
+
+
+def _read_each(folder: Path, *readers: Callable[[Path], object]) -> object:
+    """Read all files of a folder by themselves. SSADError if one is refused, after all were read."""
+    error: SSADError | None = None
     for path in sorted(folder.iterdir()):
-        try:
-            point_file = read_point_file(path)
-            encode_points_like(point_file, point_file.points)
-        except SSADError as error:
-            problems.append(check_line(error))
-    return problems
+        for read in readers:
+            try:
+                read(path)
+            except SSADError as refusal:
+                error = refusal
+    if error is not None:
+        raise error
+    return None
 
 
 def _images(folder: Path) -> Sequence[Path]:
     from PIL import Image
 
     pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    for name in ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif"):
+    for name in ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif", "f.ppm"):
         Image.fromarray(pixels).save(folder / name)
-    Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "f.tif")
-    Image.fromarray(pixels).convert("CMYK").save(folder / "g.jpg")
-    Image.fromarray(pixels[..., 0]).save(folder / "h.pgm")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turned
+    Image.fromarray(pixels).save(folder / "g.jpg", exif=exif, progressive=True)
+    Image.fromarray(pixels).convert("CMYK").save(folder / "h.jpg")
+    Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "i.png")
+    Image.fromarray(pixels).convert("P").save(folder / "j.png")
     return sorted(folder.iterdir())
 
 
@@ -654,14 +720,7 @@ def _read_images(folder: Path) -> object:
         image_file = read_image_file(path)
         return encode_like(image_file, image_file.rgb)
 
-    problems = []
-    for path in sorted(folder.iterdir()):
-        for read in (write_anew, as_images):
-            try:
-                read(path)
-            except SSADError as error:
-                problems.append(check_line(error))
-    return problems
+    return _read_each(folder, write_anew, as_images)
 
 
 def _mesh(folder: Path) -> Sequence[Path]:
@@ -714,7 +773,7 @@ def _read_gltf(folder: Path) -> object:
 READERS: dict[str, Reader] = {
     "suite": Reader(_suite, _read_suite),
     "scenarios": Reader(_scenario_file, _read_scenario_file),
-    "map": Reader(_town, _read_map),
+    "map": Reader(_map, _read_map),
     "town": Reader(_graph, _read_graph),
     "openscenario": Reader(_openscenario, _read_openscenario),
     "commonroad": Reader(_commonroad, _read_commonroad),
@@ -723,15 +782,16 @@ READERS: dict[str, Reader] = {
     "run": Reader(_run, _read_run),
     "unsealed-run": Reader(_unsealed_run, _read_run),
     "report": Reader(_unsealed_run, _read_report),
+    "compare": Reader(_two_runs, _read_comparison),
     "trace": Reader(_trace, _read_trace),
     "policy": Reader(_policy, _read_policy),
-    "checkpoint": Reader(_checkpoint, _read_checkpoint),
+    "checkpoint": Reader(_checkpoint, _read_checkpoint, is_single=True),
     "nuscenes": Reader(_nuscenes, _read_nuscenes),
+    "drive": Reader(_drive, _read_drive),
     "results": Reader(_results, _read_results),
     "coco": Reader(_coco, _read_coco),
-    "points": Reader(_points, _read_points),
-    "clouds": Reader(_clouds, _read_clouds),
-    "images": Reader(_images, _read_images),
+    "points": Reader(_points, _read_points, is_single=True),
+    "images": Reader(_images, _read_images, is_single=True),
     "obj": Reader(_mesh, _read_mesh),
     "gltf": Reader(_gltf, _read_gltf),
 }
@@ -793,6 +853,8 @@ def fuzz(name: str, indices: Sequence[int], *, seed: int = 0, show: bool = False
         paths = sorted(reader.make(folder))
         contents = {path: path.read_bytes() for path in paths}
         reader.read(folder)
+        for path in paths if reader.is_single else ():
+            path.unlink()
         for index in indices:
             draw = random.Random(f"{seed} {name} {index}")
             path = draw.choice(paths)
@@ -813,7 +875,10 @@ def fuzz(name: str, indices: Sequence[int], *, seed: int = 0, show: bool = False
                 if show:
                     traceback.print_exception(error)
             tally.slowest = max(tally.slowest, time.perf_counter() - began)
-            path.write_bytes(contents[path])
+            if reader.is_single:
+                path.unlink()
+            else:
+                path.write_bytes(contents[path])
     return tally
 
 

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.command import ssad
 from helpers.run_folder import DRIVING_HEADER, driving_line, reseal, write_run
 
 from ssad.core.errors import StoreError
+from ssad.core.image_files import encode_jpeg
 from ssad.engine.store import Store
 from ssad.experiments.runs import write_report
+from ssad.recorders.shifted.image_folder import shift_pictures
 from ssad.report.load import load_run
 from ssad.results import load_results
 
 
 @pytest.fixture
-def victim(tmp_path: Path) -> Path:
+def victim(tmp_path: Path) -> Iterator[Path]:
     """A folder of the user, which must stay as it is."""
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "f").write_text("mine\n")
@@ -136,8 +141,29 @@ def test_wrong_paths_are_found_before_heavy_packages_load(tmp_path: Path) -> Non
         "export texture none x out",
         "export light none x out",
         "export RightTurn/00 full --format openscenario",
+        "import map none.xodr",
+        "import routes none",
+        "import openscenario none.xosc out.yaml",
+        "import leaderboard none.xml out.yaml",
+        "import commonroad none.xml out.yaml",
+        "import drive none out.yaml --scene a",
     )
     script = NO_HEAVY_PACKAGE.format(commands=commands)
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("\n") == len(commands), "one line each"
+
+
+@pytest.mark.parametrize("place", ["fog-3", "fog-3/sub"])
+def test_pictures_are_not_shifted_through_a_link(tmp_path: Path, victim: Path, place: str) -> None:
+    (tmp_path / "data" / "sub").mkdir(parents=True)
+    pixels = np.full((24, 32, 3), 120, np.uint8)
+    (tmp_path / "data" / "sub" / "f").write_bytes(encode_jpeg(pixels))
+    (tmp_path / "data" / "sub" / "a.jpg").write_bytes(encode_jpeg(pixels))
+    settings = {"seed": 0, "calibration": "physical", "quality": 95, "subsampling": "auto", "lidar": True}
+    options = {"shifts": ["fog"], "severities": [3], "settings": settings, "workers": 0}
+    shift_pictures(tmp_path / "data", tmp_path / "out", **options)
+    shutil.rmtree(tmp_path / "out" / place)
+    (tmp_path / "out" / place).symlink_to(victim)
+    with pytest.raises(StoreError, match=f"{place}: is a symbolic link"):
+        shift_pictures(tmp_path / "data", tmp_path / "out", **options)

@@ -77,6 +77,7 @@ def import_map(
 
     A page with this report and a picture from above is written too.
     """
+    paths.check_exists(file)
     from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
@@ -148,6 +149,7 @@ def import_drive(
 
     Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
     """
+    paths.check_exists(root)
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
     from ssad.scenarios.dynamic import save_scenarios

@@ -14,7 +14,7 @@ from ssad.core.folders import RECORDING_FILE, RUN_FILE, check_output_folder
 
 RUN = (RUN_FILE,)
 COMPARISON = (RUN_FILE, "compare.html")
-REPLAYS = ("[0-9a-f]" * 12 + "*.npz", "[0-9a-f]" * 12 + "*.jpg")
+REPLAYS = ("[0-9a-f]" * 16 + "*.npz", "[0-9a-f]" * 16 + "*.jpg")
 TRAINING = ("log.jsonl", "last.pt")
 RECORDING = (RECORDING_FILE,)
 SHIFTED = (RUN_FILE, "*/manifest/identity.json")
@@ -25,7 +25,7 @@ EXPORTED_TEXTURE = ("texture.json",)
 EXPORTED_LIGHT = ("light.json",)
 """Names of what a command writes, by which it knows its own folder."""
 
-NAMED_FILE = re.compile(r"(?:[^\s,\[\]{}'\"=]*:)?([^\s,\[\]{}'\"=:?*]+\.(?:yaml|yml|safetensors|py|xodr|xosc|onnx))\b")
+NAMED_FILE = re.compile(r"(?:[\w.-]+:)?([^\s:?@*]+\.(?:yaml|yml|safetensors|py|xodr|xosc|onnx))(?:[:?@].*)?")
 
 
 def check_out(folder: Path | None, patterns: Sequence[str], *, option: str = "--out") -> None:
@@ -84,7 +84,7 @@ def check_named_files(suite: str, settings: Sequence[str]) -> None:
         if separator:
             texts += list(_texts(parse_yaml(text, f"--set {key.strip()}")))
     for text in texts:
-        match = NAMED_FILE.match(text)
+        match = NAMED_FILE.fullmatch(text)
         if match and not any((folder / Path(match[1]).expanduser()).exists() for folder in beside):
             raise ConfigError(f"{match[1]}: no such file{_suggestion(Path(match[1]))}")
 

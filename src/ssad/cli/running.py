@@ -28,8 +28,7 @@ def run(
         str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]"),
+        Path | None, typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]")
     ] = None,
     settings: Annotated[
         list[str] | None,

@@ -90,7 +90,8 @@ class ImageFile:
     def rgb(self) -> U8:
         """The upright pixels as uint8 [H, W, 3]; 16 bits are rounded to 8, grey is repeated."""
         pixels = to_8_bits(self.pixels)
-        return pixels if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
+        # Not `broadcast_to`, whose result is read-only: images are drawn on and handed to torch.
+        return np.ascontiguousarray(pixels) if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
 
     @property
     def has_16_bits(self) -> bool:
