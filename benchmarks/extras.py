@@ -29,8 +29,11 @@ class Environment:
 
 
 COMMONROAD = "tests/interchange/test_commonroad_writer_tools.py"
+COMMONROAD_FILES = "tests/interchange/test_commonroad_other.py"
 ENVIRONMENTS = {
-    "commonroad": Environment(("--extra", "commonroad"), (COMMONROAD, "-k", "valid or overlap")),
+    "commonroad": Environment(
+        ("--extra", "commonroad"), (COMMONROAD, COMMONROAD_FILES, "-k", "valid or overlap or protobuf or 2018")
+    ),
     "crime": Environment(("--group", "crime"), (COMMONROAD, "-k", "crime")),
     "scenic": Environment(("--extra", "scenic"), ("tests/interchange/test_scenic.py",)),
 }

@@ -11,20 +11,20 @@ import pytest
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError
-from ssad.core.traces import first_difference, load_trace, save_trace, trace_hash
-from ssad.core.types import EpisodeTrace
+from ssad.core.traces import first_difference, load_trace, merge_steps, save_trace, trace_hash
+from ssad.core.types import EpisodeTrace, array_dtypes
 
 T, A, S = 5, 3, 2
 SMALL_HASH = "cca9d38a0c85684b7807bc25da3ced9dd663ef93e79f3a1f4a76fe7a1d871678"
 
 
-def make_trace(seed: int = 0) -> EpisodeTrace:
+def make_trace(seed: int = 0, steps: int = T) -> EpisodeTrace:
     rng = np.random.default_rng(seed)
-    shapes = {"kind": (A,), "length": (A,), "width": (A,), "signal_ids": (S,), "signal": (T, S), "route": (7, 2)}
-    shapes |= dict.fromkeys(("x", "y", "yaw", "speed", "active"), (T, A))
+    shapes = {"kind": (A,), "length": (A,), "width": (A,), "signal_ids": (S,), "signal": (steps, S), "route": (9, 2)}
+    shapes |= dict.fromkeys(("x", "y", "yaw", "speed", "active"), (steps, A))
     kinds = {"F32": np.float32, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
     values = {
-        f.name: (rng.random(shapes.get(f.name, (T,))) * 3).astype(kinds[str(f.type)])
+        f.name: (rng.random(shapes.get(f.name, (steps,))) * 3).astype(kinds[str(f.type)])
         for f in fields(EpisodeTrace)
         if str(f.type) in kinds
     }
@@ -139,3 +139,29 @@ def test_a_difference_is_told_by_name_values_and_step() -> None:
     shorter = replace(trace, accel=trace.accel[:-2], x=trace.x + 1)
     assert str(first_difference(trace, shorter)).startswith("step 0: x: ")
     assert first_difference(trace, replace(trace, accel=trace.accel[:-2])) == "step 3: accel: shape (5,) against (3,)"
+
+
+def test_merged_steps_add_up_events_and_keep_the_last_state() -> None:
+    trace = replace(
+        make_trace(steps=7),
+        dt=0.05,
+        contact=np.array([0, 1, 0, 0, 4, 2, 0], np.uint8),
+        contact_agent=np.array([-1, 1, -1, -1, 2, 1, -1], np.int32),
+        lane_invasion=np.array([0, 1, 1, 0, 0, 0, 1], np.uint8),
+        throttle=np.array([0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.25], np.float32),
+    )
+    merged = merge_steps(trace, 2)
+    assert merged.dt == 0.1
+    for name in ("x", "speed", "active", "driven", "signal"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(trace, name)[[0, 2, 4, 6]])
+    assert merged.contact.tolist() == [0, 1, 4, 2]
+    assert merged.contact_agent.tolist() == [-1, 1, 2, 1]
+    assert merged.lane_invasion.tolist() == [0, 2, 0, 1]
+    assert merged.throttle.tolist() == [0.0, 0.75, 0.0, 0.625]
+    odd = merge_steps(replace(make_trace(steps=6), dt=0.05), 2)
+    assert len(odd.x) == 4, "the last step is a half"
+    np.testing.assert_array_equal(odd.x[-1], make_trace(steps=6).x[-1])
+    for name in array_dtypes(EpisodeTrace):
+        assert getattr(merged, name).dtype == getattr(trace, name).dtype, name
+        if getattr(trace, name).ndim and getattr(trace, name).shape[0] == 7:
+            assert len(getattr(merged, name)) == 4, name

@@ -263,7 +263,7 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "entities": (_cut(ROOT, f'<!DOCTYPE a [<!ENTITY b "c">]>{ROOT}'), "refused"),
     "external": (_cut(ROOT, f'<!DOCTYPE a SYSTEM "/etc/passwd">{ROOT}'), "refused"),
     "another format": (lambda _: "<OpenSCENARIO/>", "not CommonRoad XML"),
-    "another version": (_cut("2020a", "2018b"), "commonRoadVersion is '2018b'; only 2020a"),
+    "another version": (_cut("2020a", "2017a"), "commonRoadVersion is '2017a'; 2020a and 2018b are read"),
     "no step": (_cut('timeStepSize="0.2"', 'timeStepSize="0"'), "timeStepSize is 0 s"),
     "no lanelets": (lambda text: re.sub("(?s)<lanelet id.*</lanelet>", "", text), "it has no lanelet"),
     "one point": (lambda text: re.sub("<leftBound>.*?<line", "<leftBound><line", text), "fewer than two points"),

@@ -10,7 +10,7 @@ import pytest
 from helpers.command import ssad
 from helpers.generated import generated
 
-from ssad.core.types import Scenario
+from ssad.core.types import Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1, read_leaderboard
 from ssad.metrics import episode_metrics
@@ -107,6 +107,60 @@ def test_what_is_not_played_is_named(tmp_path: Path) -> None:
         "speed of DynamicObjectCrossing",
     ):
         assert f"not carried over: {line}" in done.stdout
+
+
+ALONE = """<?xml version="1.0"?><routes>
+<route id="0" town="ProvingGround">{first}</route>
+<route id="1" town="ProvingGround"><waypoints><position x="217" y="5.25" z="0"/><position x="517" y="5.25" z="0"/>
+</waypoints></route></routes>"""
+WAYPOINTS = "".join(
+    f'<waypoint x="{x}" y="5.25" z="0" yaw="0" pitch="0" roll="0"/>' for x in (217, 317)
+)  # of leaderboard 1.0
+
+
+def test_routes_without_scenarios_are_free_drives_in_traffic(tmp_path: Path) -> None:
+    """Of leaderboard 2.0 and 1.0; the ego meets vehicles all along, and the signals follow their programmes."""
+    (tmp_path / "r.xml").write_text(ALONE.format(first=WAYPOINTS))
+    done = ssad("import", "leaderboard", tmp_path / "r.xml", tmp_path / "out.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "2 scenarios on ProvingGround" in done.stdout
+    assert "not carried over" not in done.stdout
+    assert "import: 2/2 routes" in done.stderr
+    short, long = read_scenarios(tmp_path / "out.yaml")
+    assert short.route[0] == Pose(217.0, -5.25, 0.0)
+    assert (short.type, short.limits.max_time, long.limits.max_time) == ("FreeDrive", 85.0, 245.0)
+    town = load_town("ProvingGround")
+    episodes = [build_episode(scenario, town, seed=0) for scenario in (short, long)]
+    for episode in episodes:
+        route = episode.agents[0].route
+        assert route is not None
+        starts = np.array([(agent.pose.x, agent.pose.y) for agent in episode.agents[1:]])
+        assert 5 <= len(starts) <= 40
+        assert np.hypot(*(starts - route.xy[0]).T).min() > 25.0
+        assert all(np.hypot(*(route.xy - start).T).min() <= 52.5 for start in starts)
+        assert not episode.signal_override
+    assert len(episodes[1].agents) > len(episodes[0].agents)
+    names = [tuple(agent.pose for agent in build_episode(short, town, seed=seed).agents) for seed in (0, 0, 1)]
+    assert names[0] == names[1] != names[2]
+    (trace,) = rollout(World(episodes[:1], {town.name: town}), make_system("autopilot"))
+    assert trace.end == "complete"
+    moved = np.hypot(np.ptp(trace.x, axis=0), np.ptp(trace.y, axis=0))
+    assert (moved[1:] > 5.0).sum() >= 2, "traffic drives"
+    (tmp_path / "routes").mkdir()
+    (tmp_path / "routes" / "r.xml").write_text(
+        f'<routes><route id="0" town="ProvingGround">{WAYPOINTS}</route></routes>'
+    )
+    done = ssad("import", "routes", tmp_path / "routes", "--name", "alone")
+    assert done.returncode == 0, done.stderr
+    assert "set alone: 1 scenarios on ProvingGround" in done.stdout
+
+
+def test_a_free_drive_on_an_unknown_town_is_named(tmp_path: Path) -> None:
+    text = ALONE.format(first=WAYPOINTS).replace('id="0" town="ProvingGround"', 'id="0" town="Elsewhere"')
+    (tmp_path / "r.xml").write_text(text)
+    scenarios, omissions = read_leaderboard(tmp_path / "r.xml")
+    assert [scenario.name for scenario in scenarios] == ["leaderboard/1/FreeDrive"]
+    assert omissions == ("town Elsewhere is not imported: its scenarios cannot be built (ssad import map)",)
 
 
 def _cut(old: str, new: str = "") -> Callable[[str], str]:

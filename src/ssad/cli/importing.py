@@ -104,14 +104,18 @@ def import_leaderboard(
 ) -> None:
     """Turn routes of leaderboard 2.0 or Bench2Drive into scenarios; `ssad import routes` reads leaderboard 1.0.
 
-    Their towns must be imported before they are driven.
+    Routes without scenarios become free drives in natural traffic. Their towns must be imported before they are driven.
     """
     paths.check_exists(file)
+    from rich.console import Console
+
+    from ssad.engine.progress import LiveProgress
     from ssad.interchange.leaderboard import read_leaderboard
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    imported, omissions = read_leaderboard(file)
+    with LiveProgress("import", 1, 0, console=Console(stderr=True), unit="routes") as progress:
+        imported, omissions = read_leaderboard(file, report=progress.show)
     save_scenarios(out, imported)
     print(
         f"{len(imported)} scenarios on {', '.join(sorted({scenario.town for scenario in imported}))}; written to {out}"
@@ -120,15 +124,16 @@ def import_leaderboard(
 
 
 def import_commonroad(
-    file: Annotated[Path, typer.Argument(metavar="FILE.xml", help="CommonRoad XML file, 2020a.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CommonRoad XML file, 2020a or 2018b, or protobuf.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
     on: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: its lanelets]")
     ] = None,
 ) -> None:
-    """Turn a CommonRoad XML file (2020a) into a scenario, and say what it does not carry over.
+    """Turn a CommonRoad file into a scenario, and say what it does not carry over.
 
-    Lanelets that are no town's yet are stored as a town beside OUT.yaml too.
+    XML 2018b and protobuf need the extra `commonroad`. Lanelets that are no town's yet are stored as a town beside
+    OUT.yaml too.
     """
     paths.check_exists(file)
     from ssad.interchange.commonroad_reader import read_commonroad

@@ -264,6 +264,7 @@ class Driver(Protocol):
     """Controls an agent ten times a second: the ego, or any other vehicle, cyclist or walker.
 
     A driver with an attribute `target_speed` (m/s) drives at that speed instead of the episode's; one with an
+    attribute `period` (s, a whole fraction of 0.1) is asked that often by `ssad run` in the embedded world; one with an
     attribute `sensors` (names) gets their readings in `Observation.readings`; one with the methods of `Branching` can
     be measured by splitting and importance sampling. A minimal class may omit `name` and
     `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` tests an

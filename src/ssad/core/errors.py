@@ -148,6 +148,7 @@ EXTRA_OF = {
     "torch": "perception",
     "torchvision": "perception",
     "scenic": "scenic",
+    "commonroad": "commonroad",
     "onnx": "onnx",
     "onnx2torch": "onnx",
 }

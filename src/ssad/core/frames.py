@@ -39,6 +39,13 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
+class DepthCamera:
+    """A camera that measures depth: metres along its optical axis in place of colours."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One exposure of one camera, without its pixels.
 

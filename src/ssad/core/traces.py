@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,10 @@ from ssad.core.types import EpisodeTrace, array_dtypes
 FORMAT = 1
 _ARRAYS = array_dtypes(EpisodeTrace)
 _META = [f.name for f in fields(EpisodeTrace) if f.name not in _ARRAYS]
+_PER_STEP = (
+    *("x", "y", "yaw", "speed", "active", "accel", "contact", "contact_agent", "off_road", "route_distance"),
+    *("route_complete", "driven", "lane_invasion", "red_light", "stop_sign", "throttle", "brake", "steer", "signal"),
+)
 _PER_AGENT = ("x", "y", "yaw", "speed", "active")
 
 
@@ -27,6 +31,32 @@ def _meta(trace: EpisodeTrace) -> dict[str, Any]:
 
 def _arrays(trace: EpisodeTrace) -> dict[str, npt.NDArray[Any]]:
     return {name: np.ascontiguousarray(getattr(trace, name), dtype) for name, dtype in _ARRAYS.items()}
+
+
+def merge_steps(trace: EpisodeTrace, count: int) -> EpisodeTrace:
+    """Return a trace with `count` steps merged into one; the last one may hold fewer.
+
+    States are those at the end of the merged steps; events are added up; controls and the acceleration are means.
+
+    Args:
+        trace: The trace.
+        count: Steps that make one.
+    """
+    row_count = len(trace.x)
+    ends = np.unique([0, *range(count, row_count, count), row_count - 1])
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    merged: dict[str, Any] = {name: getattr(trace, name)[ends] for name in _PER_STEP}
+    for name in ("lane_invasion", "red_light", "stop_sign"):
+        merged[name] = np.add.reduceat(getattr(trace, name), starts).astype(getattr(trace, name).dtype)
+    merged["contact"] = np.bitwise_or.reduceat(trace.contact, starts)
+    for name in ("accel", "throttle", "brake", "steer"):
+        values = getattr(trace, name)
+        sums = np.add.reduceat(values.astype(np.float64), starts)
+        merged[name] = (sums / (ends - starts + 1)).astype(values.dtype)
+    for row, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        touched = trace.contact_agent[start : end + 1]
+        merged["contact_agent"][row] = touched[np.argmax(touched != -1)]
+    return replace(trace, dt=trace.dt * count, **merged)
 
 
 def save_trace(path: str | Path, trace: EpisodeTrace) -> None:

@@ -101,11 +101,13 @@ class _NamedDriver:
         self.name = name
         self.controller = controller
         self.target_speed: float | None = getattr(system, "target_speed", None)
+        self.period: float = getattr(system, "period", 0.1)
         self.version: str = getattr(system, "version", "")
         self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset
         self.act = system.act
         self.cameras: Mapping[str, Camera] = getattr(system, "cameras", {})
+        self.depth_cameras: Mapping[str, Camera] = getattr(system, "depth_cameras", {})
         self.lidars: Mapping[str, Lidar] = getattr(system, "lidars", {})
         self.radars: Mapping[str, Lidar] = getattr(system, "radars", {})
         if isinstance(system, Believer):

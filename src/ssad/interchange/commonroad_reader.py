@@ -1,7 +1,8 @@
-"""CommonRoad XML 2020a as a scenario: obstacles replay their trajectories, and the ego gets the planning problem.
+"""CommonRoad files as scenarios: obstacles replay their trajectories, and the ego gets the planning problem.
 
-If the lanelets are those of an existing town, the scenario takes place in that town; else they become a town.
-Features without a counterpart are listed in `ImportedCommonRoad.omissions`.
+XML 2020a is read here, protobuf and XML 2018b through commonroad-io. If the lanelets are those of an existing town,
+the scenario takes place in that town; else they become a town. Features without a counterpart are listed in
+`ImportedCommonRoad.omissions`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import F64, EpisodeLimits, LaneType, Pose, Route, Scenario, SignalPlan
 from ssad.interchange.commonroad_lanelets import ImportedLanes, read_lanes
 from ssad.interchange.commonroad_obstacles import ObstacleReader
+from ssad.interchange.commonroad_other import convert, is_protobuf
 from ssad.interchange.commonroad_writer import benchmark_map
 from ssad.interchange.commonroad_xml import STEP, VERSION, TextReader, parse_source
 from ssad.interchange.ego_start import start_parameters
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 MAX_BYTES: Final = 128 * MIB
+OLDER: Final = "2018b"
 WAY: Final = 200.0  # m, length of the route along its lane of an ego without a goal
 ALIKE: Final = 0.01  # m, largest distance between lanes of a file and of a town that count as the same
 
@@ -66,18 +69,24 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
         map_name: Its town, or a file of that town, instead of its lanelets.
 
     Raises:
-        FormatError: The file is broken, or is not CommonRoad XML 2020a.
+        FormatError: The file is broken, or is not a CommonRoad scenario.
+        MissingExtraError: It is protobuf or XML 2018b, and commonroad-io is not installed.
         MapError, UnknownNameError: Its lanelets form no valid town, or the named town does not exist.
         RouteError: The ego's route does not lie on the town's roads.
         ConfigError: The scenario cannot be driven.
     """
-    root = read_xml(path, limit=MAX_BYTES)
     location = str(path)
-    if root.tag != "commonRoad":
-        raise FormatError(f"{location}: not CommonRoad XML: its root is <{root.tag[:40]}>")
-    version = root.get("commonRoadVersion", "")
-    if version != VERSION:
-        raise FormatError(f"{location}: commonRoadVersion is '{version[:20]}'; only {VERSION} is read")
+    if is_protobuf(path, limit=MAX_BYTES):
+        root = convert(path, protobuf=True, limit=MAX_BYTES)
+    else:
+        root = read_xml(path, limit=MAX_BYTES)
+        if root.tag != "commonRoad":
+            raise FormatError(f"{location}: not CommonRoad XML: its root is <{root.tag[:40]}>")
+        version = root.get("commonRoadVersion", "")
+        if version == OLDER:
+            root = convert(path, protobuf=False, limit=MAX_BYTES)
+        elif version != VERSION:
+            raise FormatError(f"{location}: commonRoadVersion is '{version[:20]}'; {VERSION} and {OLDER} are read")
     reader = _Reader(location, root)
     try:
         return reader.read(Path(path).stem, town or Path(path).stem, map_name)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +29,8 @@ from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
 from ssad.interchange.openscenario_places import AttributeReader
 from ssad.scenarios.dynamic import CUSTOM, build_episode
+from ssad.scenarios.dynamic.catalogue import FREE_DRIVE
+from ssad.scenarios.dynamic.importer import free_drive
 from ssad.scenarios.dynamic.knowledge._placing import trigger_index
 from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
 from ssad.world.roads import load_town, route_along, town_names
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 MAX_BYTES: Final = 64 * MIB
 OWN: Final = "ssad"  # child of a scenario element that holds the scenario in our own format
+NO_TOWN: Final = "town {} is not imported: its scenarios cannot be built (ssad import map)"
 MOVED: Final = 0.01  # m; larger shifts of a point count as edits of the file
 ROUND: Final = 1.5  # largest ratio of a route's length to the distance along its points
 TYPES_2: Final[Mapping[str, str]] = {
@@ -66,15 +69,20 @@ TYPES_1: Final[Mapping[str, str]] = {
 """Class -> type of leaderboard 1.0."""
 
 
-def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]:
+def read_leaderboard(
+    path: Path, *, report: Callable[[int, int], None] = lambda completed, total: None
+) -> tuple[tuple[Scenario, ...], tuple[str, ...]]:
     """Read the scenarios of a file of routes of leaderboard 2.0.
+
+    A route without scenarios is a free drive in natural traffic, also one with the waypoints of leaderboard 1.0.
 
     Args:
         path: The file.
+        report: Called after each route with the number of routes that are read, and of all.
 
     Returns:
-        One scenario for each scenario element that can be played here, and the features that are not carried
-        over, one line each.
+        One scenario for each scenario element that can be played here and for each route without one, and the
+        features that are not carried over, one line each.
 
     Raises:
         FormatError: The file is broken, or no scenario in it can be played.
@@ -84,14 +92,21 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
     values, omissions, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
     towns = town_names()
-    for route in root.iterfind("route"):
+    routes = root.findall("route")
+    for route_number, route in enumerate(routes):
+        report(route_number, len(routes))
         route_id, town = values.text(route, "id"), values.text(route, "town")
         points = _points(values, route)
         if route.find("weathers/weather") is not None:
             omissions["weather of a route"] += 1
         elements = route.findall("scenarios/scenario")
         if not elements:
-            omissions["a route without a scenario"] += 1
+            try:
+                scenarios.append(_free_drive(route_id, town, points, path))
+            except ConfigError as error:
+                raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
+            except SSADError as error:
+                omissions[str(error)] += 1
         for element_index, element in enumerate(elements):
             type_name = values.text(element, "type")
             template = Scenario(
@@ -108,7 +123,7 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
                 omissions[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
                 continue
             if town not in towns:
-                omissions[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
+                omissions[NO_TOWN.format(town)] += 1
                 continue
             try:
                 scenario = (
@@ -128,14 +143,27 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
     if not scenarios:
         reasons = "; ".join(list(omissions)[:3]) or "it has no route"
         raise FormatError(f"{path}: no scenario in it can be played here: {reasons}")
+    report(len(routes), len(routes))
     return tuple(scenarios), tuple(
         f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in omissions.items()
     )
 
 
+def _free_drive(route_id: str, town: str, points: tuple[Pose, ...], path: Path) -> Scenario:
+    """Return the free drive of a route, checked. RouteError: its town is not imported, or does not allow it."""
+    source = f"leaderboard route {route_id} of {path.name}"
+    scenario = free_drive(f"leaderboard/{route_id}/{FREE_DRIVE}", town, points, source=source)
+    scenario_from(scenario_data(scenario))  # checks names and places before they are used
+    if town not in town_names():
+        raise RouteError(NO_TOWN.format(town))
+    build_episode(scenario, load_town(town), seed=0)
+    return scenario
+
+
 def _points(values: AttributeReader, route: Node) -> tuple[Pose, ...]:
     """Return the key points of a route, each with the heading to the next."""
-    positions = [_place(values, element) for element in route.iterfind("waypoints/position")]
+    elements = route.findall("waypoints/position") or route.findall("waypoint")
+    positions = [_place(values, element) for element in elements]
     # Repeated points have no heading to the next.
     positions = [
         position

@@ -134,6 +134,10 @@ class Onboard:
         """Return the six cameras of nuScenes by channel, with images of this width in pixels (16:9)."""
         return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
 
+    def depth_camera(self, camera: Camera) -> OnboardDepthCamera:
+        """Return a depth camera as a sensor: metres along the optical axis, float32 [N, height, width]; inf: sky."""
+        return OnboardDepthCamera(self, camera)
+
     def group_cameras(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
         """Return cameras that are always read together: those of one size are rendered in one call.
 
@@ -403,6 +407,26 @@ class OnboardCamera:
             for start in range(0, len(group), views_per_call):
                 batch = group[start : start + views_per_call]
                 yield batch, self.onboard.render(batch, cameras)
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardDepthCamera:
+    """Depth camera that agents carry, see `Onboard.depth_camera`."""
+
+    onboard: Onboard
+    camera: Camera
+
+    def follow(self, simulator: Simulator) -> None:
+        """Record the poses of this step for the shared scenes."""
+        self.onboard.follow(simulator)
+
+    def __call__(self, simulator: Simulator, agents: I32) -> F32:
+        """Return depths [N, H, W] of agents [N, 2] (scene, agent); inf if the episode has ended."""
+        depths = np.full((len(agents), self.camera.height, self.camera.width), np.inf, np.float32)
+        camera = OnboardCamera(self.onboard, self.camera)
+        for batch, rendering in camera.render_batches(self.onboard.agent_views(simulator, agents)):
+            depths[[agent_view.row for agent_view in batch]] = rendering.depth.numpy()  # type: ignore[attr-defined]
+        return depths
 
 
 @dataclass(frozen=True, slots=True)

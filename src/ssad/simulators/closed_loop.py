@@ -18,10 +18,11 @@ from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
 from ssad.core.registry import Reference, check_arguments, make, resolve
 from ssad.core.source import plugin_version, source_version
+from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 if TYPE_CHECKING:
-    from ssad.core.frames import Camera
+    from ssad.core.frames import Camera, DepthCamera
     from ssad.drivers.careful.grade import Grade
     from ssad.rendering.lidar import Lidar
 
@@ -234,6 +235,7 @@ def drive(
     from ssad.drivers import make_system
     from ssad.simulators.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
+    from ssad.world.world import World
 
     # Runs that are to be compared can share the noise of their sensors through this key.
     episodes = [replace(build_requested_episode(request), key=key(request)) for request in requests]
@@ -244,6 +246,8 @@ def drive(
         if callable(getattr(agent_driver, "to", None)):
             agent_driver.to(device)  # type: ignore[attr-defined]
     simulator_name = requests[0].spec.get("simulator", EMBEDDED)
+    is_embedded = simulator_name == EMBEDDED and not runs_in_highway_env(requests[0])
+    steps_in_one = steps_per_trace_step(system) if is_embedded else 1
     simulator: Simulator
     if is_carla(simulator_name):
         from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
@@ -263,12 +267,20 @@ def drive(
             }
     elif runs_in_highway_env(requests[0]):
         simulator = HighwayEnv(episodes, graphs)
+    elif steps_in_one > 1:
+        finer_episodes = [
+            replace(episode, limits=replace(episode.limits, max_steps=episode.limits.max_steps * steps_in_one))
+            for episode in episodes
+        ]
+        simulator = World(finer_episodes, graphs, device=device, dt=STEP / steps_in_one, substeps=1)
     else:
         simulator = make_simulator(simulator_name, episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
+        if steps_in_one > 1:  # traces have steps of 0.1 s, however often a driver is asked
+            traces = [merge_steps(trace, steps_in_one) for trace in traces]
         simulator_metrics = dict(getattr(simulator, "measured", {})) if is_carla(simulator_name) else {}
     finally:
         # External simulators hold a connection, which must end even if a driver raises.
@@ -280,19 +292,34 @@ def drive(
     )
 
 
-def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+def steps_per_trace_step(driver: Driver) -> int:
+    """Return how often a driver is asked in a step of 0.1 s: once, or by its `period`.
+
+    Raises:
+        ConfigError: Its period does not divide 0.1 s.
+    """
+    period = float(getattr(driver, "period", STEP))
+    count = round(STEP / period) if period > 0.0 else 0
+    if count < 1 or abs(count * period - STEP) > 1e-6:
+        raise ConfigError(f"system {driver.name}: its period is {period:g} s; it must divide {STEP} s, such as 0.05")
+    return count
+
+
+def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | DepthCamera | tuple[str, Lidar]]:
     """Return the sensors that drivers name in `sensors`, by name.
 
     Returns:
-        Cameras, and pairs ("lidar" or "radar", model).
+        Cameras, depth cameras, and pairs ("lidar" or "radar", model).
     """
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.camera.rig import rig_camera
     from ssad.rendering.lidar import HDL32E
 
-    sensors: dict[str, Camera | tuple[str, Lidar]] = {}
+    sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = {}
     for driver in drivers:
         # A driver's own models take precedence over the sensors of nuScenes with the same name.
-        driver_sensors: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors |= {name: DepthCamera(camera) for name, camera in getattr(driver, "depth_cameras", {}).items()}
         driver_sensors |= {
             name: ("lidar", sensor_model) for name, sensor_model in getattr(driver, "lidars", {}).items()
         }
@@ -314,6 +341,7 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     required = requested_sensors(drivers)
     if not required:
         return {}
+    from ssad.core.frames import DepthCamera
     from ssad.rendering.onboard import Onboard
     from ssad.rendering.radar import OnboardRadar
 
@@ -324,6 +352,8 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
             sensors[name] = (
                 onboard.lidar(sensor_model[1]) if sensor_model[0] == "lidar" else OnboardRadar(onboard, sensor_model[1])
             )
+        elif isinstance(sensor_model, DepthCamera):
+            sensors[name] = onboard.depth_camera(sensor_model.camera)
         else:
             sensors[name] = onboard.camera(sensor_model)
     return sensors

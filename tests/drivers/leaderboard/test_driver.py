@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +22,9 @@ from ssad.drivers import make_system
 from ssad.drivers.leaderboard import Leaderboard
 from ssad.drivers.leaderboard.carla_types import RoadOption
 from ssad.drivers.leaderboard.driver import _global_plan
-from ssad.drivers.leaderboard.sensors import geolocation
+from ssad.drivers.leaderboard.sensors import encode_depth, geolocation
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.simulators.closed_loop import onboard_sensors
+from ssad.simulators.closed_loop import drive, onboard_sensors, scenario_json
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -460,13 +463,91 @@ def test_lidar_and_radar(tmp_path: Path) -> None:
     assert comes[:, 3] == pytest.approx((-v - 7.0) * np.cos(comes[:, 1]) * np.cos(comes[:, 2]), abs=0.15)
 
 
+@dataclass(frozen=True)
+class Request:
+    """Request for an episode, as plain data."""
+
+    key: str
+    system: str
+    seed: int
+    spec: Mapping[str, Any]
+
+
+def test_agents_are_asked_twenty_times_a_second(tmp_path: Path) -> None:
+    """With half a turn of the LiDAR each time, right and left by turns; the trace has steps of 0.1 s."""
+    path = tmp_path / "often.py"
+    text = AGENT.replace("return [{", f"return {EYES[:1]} + [{{")
+    step = "def run_step(self, input_data, timestamp):\n        "
+    record = "self.seen = getattr(self, 'seen', []) + [(timestamp, input_data['lidar'])]\n        "
+    path.write_text(text.replace(step, step + record))
+    scenario = load_scenarios("StraightObstacle/00")[0]
+    spec = {"repetition": 0, "spread": 0.0}
+    requests = [
+        Request(
+            str(steps), f"leaderboard:{path}", 0, spec | {"scenario": scenario_json(replace(scenario, limits=limits))}
+        )
+        for steps, limits in ((4, EpisodeLimits(max_steps=4)), (6, EpisodeLimits(max_time=0.6)))
+    ]
+    system = make_system(f"leaderboard:{path}")
+    _, traces, _ = drive(requests, device="cpu", driver=system)
+    assert [trace.dt for trace in traces] == [0.1, 0.1]
+    assert [len(trace.x) for trace in traces] == [5, 7]
+    assert [trace.end for trace in traces] == ["max_steps", "max_time"]
+    for agent, count in zip(system.act.__self__._agents, (8, 12), strict=True):
+        times = [time for time, _ in agent.seen]
+        assert times == pytest.approx(np.arange(count) / 20)
+        assert [number for _, (number, _) in agent.seen] == list(range(count))
+        for number, (_, (_, points)) in enumerate(agent.seen):
+            side = -1.0 if number % 2 == 0 else 1.0
+            assert len(points) > 5_000
+            assert (side * points[:, 1] >= -1e-3).all(), "left, then right"
+    distance = np.hypot(np.diff(traces[1].x[:, 0]), np.diff(traces[1].y[:, 0]))
+    assert distance == pytest.approx(np.diff(traces[1].driven), abs=1e-3)
+    with pytest.raises(ConfigError, match=r"its period is 0\.03 s; it must divide 0\.1 s"):
+        drive(requests, device="cpu", driver=SimpleNamespace(name="odd", period=0.03))
+
+
+def test_depth_cameras(tmp_path: Path) -> None:
+    """24 bits over 1000 m: the rear of a van ahead, the road below, and the sky."""
+    path = tmp_path / "depth.py"
+    mount = {"x": 1.0, "y": 0.0, "z": 2.0, "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+    depth = {"type": "sensor.camera.depth", "id": "depth", "width": 80, "height": 60, "fov": 90} | mount
+    step = "def run_step(self, input_data, timestamp):\n        "
+    text = AGENT.replace("return [{", f"return {[depth]} + [{{")
+    path.write_text(text.replace(step, step + "self.seen = input_data['depth']\n        "))
+    van = Actor("van", "van", Pose(249.0, -5.25, 0.0))
+    route = (Pose(229.0, -5.25), Pose(300.0, -5.25))
+    scenario = Scenario("depth", "Custom", "ProvingGround", route, actors=(van,), limits=EpisodeLimits(max_steps=1))
+    episode = build_episode(scenario, load_town("ProvingGround"), seed=0)
+    driver = make_system(f"leaderboard:{path}")
+    world = World([episode], {episode.town: load_town(episode.town)})
+    (trace,) = rollout(world, driver, sensors=onboard_sensors([driver], "cpu"))
+    image = driver.act.__self__._agents[0].seen[1]
+    assert (image.shape, image.dtype) == ((60, 80, 4), np.uint8)
+    values = image.astype(np.float64)
+    metres = 1000.0 * (values[..., 2] + 256.0 * values[..., 1] + 65536.0 * values[..., 0]) / (256**3 - 1)
+    rear = 249.0 - 0.5 * float(trace.length[1]) - float(trace.x[0, 0]) - 1.0
+    assert metres[31:34, 38:42] == pytest.approx(rear, abs=0.3)
+    # 2 m above a level road, focal length 40 pixels: row r is at 2 * 40 / (r + 0.5 - 30)
+    assert metres[59, 30:50] == pytest.approx(2.0 * 40.0 / 29.5, abs=0.05)
+    assert (metres[0] == 1000.0).mean() > 0.5, "sky"
+
+
+def test_depths_are_encoded_as_in_carla() -> None:
+    image = encode_depth(np.array([[0.0, 1000.0, np.inf, 1000.0 / (256**3 - 1), 500.0]], np.float32))
+    assert image[0, :, :3].tolist() == [[0, 0, 0], [255] * 3, [255] * 3, [0, 0, 1], [128, 0, 0]]
+
+
 BAD = {
     "missing": (None, "no such file"),
     "broken": ("def", "importing it failed: SyntaxError"),
     "no entry": ("x = 1", "names no class"),
     "wrong entry": ("def get_entry_point(): return 'x'", "names no class"),
     "setup fails": (AGENT.replace("self.track, ", "1 / 0; self.track, "), "setup failed: ZeroDivisionError"),
-    "depth": (AGENT.replace("sensor.other.gnss", "sensor.camera.depth"), "asks for the sensor sensor.camera.depth"),
+    "flow": (
+        AGENT.replace("sensor.other.gnss", "sensor.camera.optical_flow"),
+        "asks for the sensor sensor.camera.optical_flow",
+    ),
     "no list": (AGENT.replace("return [{", "return 7; [{"), "must give a list, not int"),
     "sensors fails": (AGENT.replace("return [{", "return 1 / 0; [{"), "sensors.. failed: ZeroDivisionError"),
     "no type": (AGENT.replace("return [{", "return [{}] + [{"), "asks for the sensor None"),

@@ -587,4 +587,5 @@ def test_a_class_has_its_own_parameters_and_those_of_the_start() -> None:
         "RightTurn": 150.0,
         "CrossingNegotiation": 150.0,
         "NaturalJunction": 1.0e9,
+        "FreeDrive": 1.0e9,
     }

@@ -37,12 +37,15 @@ from ssad.drivers.leaderboard.road_map import OPTIONS, TownMap, road_options, tr
 from ssad.drivers.leaderboard.scene import STEP, CarlaDataProvider, HostedScene
 from ssad.drivers.leaderboard.sensors import (
     CAMERA,
+    DEPTH,
     LIDAR,
     MAP,
     RADAR,
     camera_of,
     carla_points,
     check_sensors,
+    encode_depth,
+    fired_points,
     geolocation,
     lidar_of,
     number,
@@ -72,6 +75,7 @@ class Leaderboard:
 
     name = "leaderboard"
     controller = Controller.EXTERNAL
+    period = STEP
 
     def __init__(self, path: str, *, share: bool = False) -> None:
         if not isinstance(share, bool):
@@ -102,7 +106,12 @@ class Leaderboard:
             for specification in self._specifications
             if specification["type"] == RADAR
         }
-        self.sensors = (*self.cameras, *self.lidars, *self.radars)
+        self.depth_cameras: Mapping[str, Camera] = {
+            specification["id"]: camera_of(specification)
+            for specification in self._specifications
+            if specification["type"] == DEPTH
+        }
+        self.sensors = (*self.cameras, *self.depth_cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
         self._episodes: list[Episode] = []
         self._scenes: list[HostedScene] = []
@@ -226,8 +235,11 @@ class Leaderboard:
                 alpha = np.full((1, *image.shape[1:]), 255, np.uint8)
                 # CARLA delivers BGRA.
                 value = np.concatenate([image[::-1], alpha]).transpose(1, 2, 0).copy()
+            elif sensor_type == DEPTH:
+                value = encode_depth(view.readings[specification["id"]][row])
             elif sensor_type == LIDAR:
-                value = carla_points(view.readings[specification["id"]][row])
+                points = carla_points(view.readings[specification["id"]][row])
+                value = fired_points(points, time - self._elapsed(view, row), time)
             elif sensor_type == RADAR:
                 returns = view.readings[specification["id"]][row]
                 value = returns[returns[:, 0] > 0.0]
@@ -244,6 +256,12 @@ class Leaderboard:
         self._last_headings[int(view.scene[row])] = (time, yaw)
         return readings
 
+    def _elapsed(self, view: Observation, row: int) -> float:
+        """Return the time since the agent was last asked, s; at the start its period."""
+        time = float(view.time[row])
+        last_time, _ = self._last_headings.get(int(view.scene[row]), (time - self.period, 0.0))
+        return time - last_time
+
     def _noise(self, view: Observation, row: int, deviations: Sequence[float], sensor: str) -> F64:
         """Return the noise of a reading, which depends on the episode and the time alone."""
         episode, step = self._episodes[int(view.scene[row])], round(float(view.time[row]) / STEP)
@@ -252,9 +270,8 @@ class Leaderboard:
 
     def _imu(self, view: Observation, row: int, yaw: float) -> F64:
         """Return accelerations and rates [6], and the compass: clockwise from north, rad."""
-        last_time, last_yaw = self._last_headings.get(int(view.scene[row]), (float(view.time[row]), yaw))
-        elapsed = float(view.time[row]) - last_time
-        yaw_rate = float(wrap_angle(yaw - last_yaw)) / elapsed if elapsed > 0.0 else 0.0
+        _, last_yaw = self._last_headings.get(int(view.scene[row]), (0.0, yaw))
+        yaw_rate = float(wrap_angle(yaw - last_yaw)) / self._elapsed(view, row)
         compass = (0.5 * math.pi - yaw) % math.tau
         lateral = -float(view.speed[row]) * yaw_rate
         return np.array([float(view.accel[row]), lateral, GRAVITY, 0.0, 0.0, -yaw_rate, compass])

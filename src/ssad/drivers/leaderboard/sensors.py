@@ -2,7 +2,8 @@
 
 CARLA: x forward, y right, z up, yaw clockwise, degrees. Source: the leaderboard's agent_wrapper.py and
 sensor_interface.py (LiDAR of 64 channels from -30 to 10 degrees, 85 m, 600,000 points a second, of which 45 % are
-lost; radar of 1,500 points a second, 100 m); for GNSS: CARLA's Mercator projection about latitude 0.
+lost; radar of 1,500 points a second, 100 m); for GNSS: CARLA's Mercator projection about latitude 0; for depth: its
+sensor reference (24 bits over 1000 m).
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.types import F32, F64
+from ssad.core.types import F32, F64, U8
 from ssad.rendering.lidar import Lidar
 
 RADIUS: Final = 6378137.0  # m, of the earth in CARLA's projection
 CAMERA: Final = "sensor.camera.rgb"
+DEPTH: Final = "sensor.camera.depth"
 LIDAR: Final = "sensor.lidar.ray_cast"
 RADAR: Final = "sensor.other.radar"
 MAP: Final = "sensor.opendrive_map"
 LIMITS: Final[Mapping[str, int]] = {
     CAMERA: 8,
+    DEPTH: 8,
     LIDAR: 2,
     RADAR: 4,
     "sensor.other.gnss": 1,
@@ -32,7 +35,10 @@ LIMITS: Final[Mapping[str, int]] = {
     MAP: 1,
     "sensor.speedometer": 1,
 }
-"""Kinds of sensors -> how many of one an agent may have."""
+"""Kinds of sensors -> how many of one an agent may have. Depth cameras are for agents outside of the competition."""
+DEPTH_RANGE: Final = 1000.0  # m
+TURNS: Final = 10.0  # of a LiDAR in a second
+_ROUNDING: Final = 1e-4  # turns
 _FADE: Final = 0.004  # 1/m by which the intensity of a LiDAR's points falls
 _RANGE, _REACH = 85.0, 100.0  # m, of LiDAR and radar
 _RIGHT: Final = np.array(
@@ -127,6 +133,29 @@ def radar_of(specification: Mapping[str, Any]) -> Lidar:
     elevations: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (vertical / 12) - 0.5 * vertical
     pose = sensor_pose(specification, _RIGHT)
     return Lidar(elevations, 12, pose, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=horizontal)
+
+
+def encode_depth(depth: F32) -> U8:
+    """Return CARLA's image of depths [H, W], m: BGRA, 24 bits over 1000 m of which red are the lowest [H, W, 4]."""
+    levels = np.rint(np.clip(depth.astype(np.float64) / DEPTH_RANGE, 0.0, 1.0) * (256**3 - 1)).astype(np.uint32)
+    image = np.full((*depth.shape, 4), 255, np.uint8)
+    for channel, shift in ((2, 0), (1, 8), (0, 16)):
+        image[..., channel] = (levels >> shift) & 255
+    return image
+
+
+def fired_points(points: F32, start: float, end: float) -> F32:
+    """Return the points of a turn [P, 4] that a LiDAR fires from one time to another, s: it turns ten times a second.
+
+    It turns clockwise and looks ahead at time 0. At 20 Hz every reading is half a turn, right and left by turns.
+    """
+    share = (end - start) * TURNS
+    if share > 1.0 - _ROUNDING:
+        return points
+    # Rounding moves the bounds of a reading, but never both of two that follow each other.
+    first = math.remainder(round(start * TURNS / _ROUNDING) * _ROUNDING, 1.0)
+    turned = np.arctan2(points[:, 1], points[:, 0]) / math.tau
+    return points[(turned - first) % 1.0 < round(share / _ROUNDING) * _ROUNDING]
 
 
 def carla_points(points: F32) -> F32:

@@ -17,11 +17,15 @@ SCENARIOS: dict[str, str] = {
     "RightTurn": f"{_HERE}.right_turn:SCENARIO",
     "CrossingNegotiation": f"{_HERE}.crossing_negotiation:SCENARIO",
     "NaturalJunction": f"{_HERE}.natural_junction:SCENARIO",
+    "FreeDrive": f"{_HERE}.free_drive:SCENARIO",
 }
 """Scenario class name -> "module:object", a `ScenarioType`."""
 
 PRECRASH: tuple[str, ...] = tuple(SCENARIOS)[:8]
 """The eight pre-crash classes, in the order of the paper's table."""
+
+FREE_DRIVE = "FreeDrive"
+"""The type of routes without a scenario of their own: natural traffic alone."""
 
 CUSTOM = "Custom"
 """The type whose scenarios list their actors themselves."""

@@ -3,10 +3,11 @@
 SafeBench and FREA: `scenario_type/*.json` lists episodes (scenario id, route id); routes are in
 `route/scenario_XX_routes/scenario_XX_route_YY.xml`, triggers and actors in
 `route/scenarios/scenario_XX.json`. Leaderboard: XML files of routes beside JSON files of triggers; every
-trigger on a route gives a scenario. In a whole checkout of SafeBench or FREA the two folders lie deeper
-(`config/scenario_type`, `scenario_data/route`) and are searched. CARLA's frame (x forward, y right, yaw clockwise
-in degrees) is converted here and nowhere else. The town is optional: a trigger is matched with the straight lines
-between key points first, then with the route through the town if it is imported. CARLA's weather is ignored.
+trigger on a route gives a scenario, a route without triggers a free drive in natural traffic. In a whole checkout of
+SafeBench or FREA the two folders lie deeper (`config/scenario_type`, `scenario_data/route`) and are searched. CARLA's
+frame (x forward, y right, yaw clockwise in degrees) is converted here and nowhere else. The town is optional: a
+trigger is matched with the straight lines between key points first, then with the route through the town if it is
+imported. CARLA's weather is ignored.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import format_location, read_json, read_xml
-from ssad.core.types import Pose, Scenario
-from ssad.scenarios.dynamic.catalogue import PRECRASH, scenario_type
+from ssad.core.types import EpisodeLimits, Pose, Scenario
+from ssad.scenarios.dynamic.catalogue import FREE_DRIVE, PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
 from ssad.world.roads import load_town
 from ssad.world.roads.router import route_along
@@ -122,7 +123,24 @@ def import_routes(folder: Path, *, omissions: list[str] | None = None) -> tuple[
         if omissions is not None:
             omissions += list_errors
         return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, omissions)
-    return _leaderboard(folder)
+    return _leaderboard(folder, omissions)
+
+
+def free_drive(name: str, town: str, points: tuple[Pose, ...], *, source: str) -> Scenario:
+    """Return the scenario of a route without scenarios: a free drive in natural traffic.
+
+    Its limit of time is the leaderboard's, 0.8 s for each metre between the points and 5 s, and at least a minute.
+
+    Args:
+        name: Name of the scenario.
+        town: Name of the town.
+        points: Key points of the route.
+        source: Origin of the route.
+    """
+    distance = sum(math.hypot(end.x - start.x, end.y - start.y) for start, end in pairwise(points))
+    max_time = float(max(math.ceil(0.8 * distance + 5.0), 60))
+    limits = EpisodeLimits(max_steps=round(10.0 * max_time), max_time=max_time)
+    return Scenario(name, FREE_DRIVE, town, points, limits=limits, group=FREE_DRIVE, source=source)
 
 
 def _list_priority(entries: Sequence[_Entry]) -> tuple[bool, int]:
@@ -328,37 +346,43 @@ def _position_along(route: _ImportedRoute, trigger: Pose) -> float | None:
 # ---------------------------------------------------------------- leaderboard 1.0
 
 
-def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
+def _leaderboard(folder: Path, omissions: list[str] | None) -> tuple[Scenario, ...]:
+    """Return a scenario for each trigger on a route, and a free drive for each route without triggers."""
     routes = sorted(folder.rglob("*.xml"))
     tables = sorted(folder.rglob("*.json"))
     if not routes:
         raise FormatError(f"{folder}: no scenario_type/*.json and no route files (*.xml) in it")
     events = [trigger_event for path in tables for trigger_event in _read_events(path, strict=False)]
-    if not events:
-        raise FormatError(f"{folder}: no JSON file with available_scenarios; put the scenarios beside the routes")
     scenarios: list[Scenario] = []
     for path in routes:
         for route in _read_roads(path):
             triggers = _triggers(route, events)
+            name, source = f"leaderboard/{path.stem}_{route.ident}", f"leaderboard route {route.ident} of {path.name}"
+            if not triggers:
+                scenarios.append(
+                    _check_scenario(free_drive(f"{name}/{FREE_DRIVE}", route.town, route.points, source=source), path)
+                )
+                if events and omissions is not None:
+                    omissions.append(f"{path}: no trigger lies on the route (2 m, 10 degrees): a free drive")
             count: Counter[str] = Counter()
             for _, event_index in triggers:
                 event = events[event_index]
                 if event.type in _PLACED and not event.placements:
                     continue
                 scenario = Scenario(
-                    name=f"leaderboard/{path.stem}_{route.ident}/{event.type}_{count[event.type]:02d}",
+                    name=f"{name}/{event.type}_{count[event.type]:02d}",
                     type=event.type,
                     town=route.town,
                     route=route.points,
                     trigger=event.trigger,
                     placements=event.placements if event.type in _PLACED else (),
                     group=event.type,
-                    source=f"leaderboard route {route.ident} of {path.name}",
+                    source=source,
                 )
                 count[event.type] += 1
                 scenarios.append(_check_scenario(scenario, path))
     if not scenarios:
-        raise FormatError(f"{folder}: no trigger lies on any route (2 m, 10 degrees)")
+        raise FormatError(f"{folder}: its triggers name no other actors, which their types need")
     return tuple(scenarios)
 
 

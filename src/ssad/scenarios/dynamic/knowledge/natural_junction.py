@@ -11,6 +11,7 @@ traffic manager); long vehicles drive only where they can turn.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -131,11 +132,28 @@ def mixed_body(rng: np.random.Generator) -> str:
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Place background vehicles that drive autonomously."""
+    plan = scenario.traffic or TRAFFIC
+    return background_vehicles(spawn_candidates(graph, route), plan, SCENARIO.values(scenario.parameters), graph, rng)
+
+
+def background_vehicles(
+    spawn_positions: Sequence[tuple[LanePosition, Pose]],
+    plan: TrafficPlan,
+    values: Mapping[str, float],
+    graph: LaneGraph,
+    rng: np.random.Generator,
+) -> list[EpisodeAgent]:
+    """Draw vehicles for a share of the places, at least 8 m apart, each with a random route of its own.
+
+    Args:
+        spawn_positions: Places on lanes and their poses.
+        plan: Share of the places, and limits of the number of vehicles.
+        values: `speed` and `speed_spread` that vehicles want, m/s.
+        graph: Lane graph of the town.
+        rng: Source of all draws.
+    """
     from ssad.world.roads import random_route
 
-    plan = scenario.traffic or TRAFFIC
-    values = SCENARIO.values(scenario.parameters)
-    spawn_positions = spawn_candidates(graph, route)
     count = min(max(int(len(spawn_positions) * plan.intensity), plan.minimum), plan.maximum)
     agents: list[EpisodeAgent] = []
     for index in rng.permutation(len(spawn_positions)):
