@@ -1,8 +1,10 @@
-"""`python benchmarks/opendrive_maps.py OUT.md FOLDER...` imports all OpenDRIVE maps of folders, and checks them.
+"""Import of public OpenDRIVE maps, and comparison with carla.Map.
 
-For each folder, such as a checkout of a public repository, the table counts the maps that import. Where the extra
-`carla` is installed, the centre of every drivable lane is compared with that of carla.Map at the same s. Maps that
-do not import, and lanes that lie elsewhere, are named below the table.
+    python benchmarks/opendrive_maps.py docs/results/map-imports.md esmini/esmini@COMMIT=FOLDER...
+
+Each folder, such as a checkout of a public repository at the commit that its name states, is searched for `.xodr`
+files. Where the extra `carla` is installed, the centres of all drivable lanes are compared with those of carla.Map at
+the same s, every half metre. The files are no part of SSAD.
 """
 
 from __future__ import annotations
@@ -11,20 +13,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from ssad.core.errors import SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.safeio import write_atomic
 from ssad.core.types import LaneType
 from ssad.world.roads.bake import bake
-from ssad.world.roads.lane_sampling import LaneSampler
-from ssad.world.roads.xodr import read_network
+from ssad.world.roads.lane_sampling import Key, LaneSampler
+from ssad.world.roads.reference_line import CLOTHOID
+from ssad.world.roads.xodr import Network, read_network
 
 CLOSE = 0.05  # m
+FAR = 1e5  # m; carla.Map's float32 coordinates are coarser than 8 mm beyond it
 TIMEOUT = 60.0  # s for carla.Map
 
 READER = """
@@ -37,17 +43,62 @@ for road, lane, s in np.load(sys.argv[2]).tolist():
     rows.append((np.nan,) * 2 if place is None else (place.transform.location.x, -place.transform.location.y))
 np.save(sys.argv[3], np.array(rows, np.float64).reshape(-1, 2))
 """
+PAGE = """# Public OpenDRIVE maps
+
+> **Stored result.** Weights: none. Torch: not used. Make it anew: `python benchmarks/opendrive_maps.py OUT.md \
+NAME@COMMIT=FOLDER...`, with checkouts of the repositories below.
+
+*Import*: `ssad import map` makes a town of the file. *Close*: every drivable lane, sampled each half metre, lies within
+{close:g} m of where carla.Map has it. Times are CPU seconds of one core.
+
+| Maps of | commit | files | import | share | compared | close | longest import, s |
+|---|---|---:|---:|---:|---:|---:|---:|
+{rows}
+
+## Files that do not import
+Each message names the fault of the file.
+
+{errors}
+
+## Maps on which the two readers differ
+carla.Map does not read `<border>`, loses lanes on arcs of no curvature and spirals of constant curvature, has
+coordinates in single precision, and steps along polynomial curves. Where a curve is not as long as the file says, SSAD
+stretches its parameter to the stated length, so that the next piece begins where the curve ends.
+
+{differences}
+"""
 
 
 @dataclass
 class Result:
-    """Import of one map: the error, its duration, s, and the distances from carla.Map of its lanes' samples, m."""
+    """Import of one map.
+
+    Attributes:
+        path: The file.
+        error: Why it does not import.
+        seconds: CPU time of the import, s.
+        places: Name of each sample.
+        distance: Distance of each sample from carla.Map's, m, nan where that has no lane; None: not compared.
+        reasons: Features of the file on which the readers differ.
+    """
 
     path: Path
     error: str = ""
     seconds: float = 0.0
     places: tuple[str, ...] = ()
-    distance: np.ndarray | None = None
+    distance: npt.NDArray[np.float64] | None = None
+    reasons: list[str] = field(default_factory=list)
+
+    @property
+    def worst(self) -> float:
+        """Greatest distance, m; 0 where nothing is compared."""
+        finite = np.zeros(0) if self.distance is None else self.distance[np.isfinite(self.distance)]
+        return float(finite.max(initial=0.0))
+
+    @property
+    def missing(self) -> int:
+        """Number of samples that carla.Map does not have."""
+        return 0 if self.distance is None else int(np.isnan(self.distance).sum())
 
 
 def check_map(path: Path) -> Result:
@@ -60,8 +111,10 @@ def check_map(path: Path) -> Result:
         result.error = str(error).replace(str(path), path.name)
         return result
     result.seconds = time.process_time() - started
-    network = read_network(path, report := ImportReport(str(path)))
+    report = ImportReport(str(path))
+    network = read_network(path, report)
     sampler = LaneSampler(network)
+    sampler.check(report)
     names = {number: name for name, number in network.road_names.items()}
     keys = [
         (road.id, index, lane)
@@ -70,85 +123,112 @@ def check_map(path: Path) -> Result:
         for lane in sorted(section.lanes)
     ]
     samples = sampler.lanes(keys)
-    rows, request = [], []
+    rows, request = [np.zeros(0, np.int64)], []
     for index, key in enumerate(keys):
-        lane = network.roads[key[0]].sections[key[1]].lanes[key[2]]
-        part = np.arange(samples.first[index], samples.first[index + 1])
-        if lane.kind != LaneType.DRIVING or not names[key[0]].isdecimal():
+        if not _is_compared(network, key, names):
             continue
-        part = part[samples.width[part] > CLOSE]
-        rows.append(part)
-        request += [(int(names[key[0]]), key[2], s) for s in samples.s[part].tolist()]
+        part = np.arange(samples.first[index], samples.first[index + 1])
+        rows.append(part[samples.width[part] > CLOSE])
+        request += [(int(names[key[0]]), key[2], s) for s in samples.s[rows[-1]].tolist()]
     centres = _carla_centres(path, np.array(request, np.float64).reshape(-1, 3))
-    if centres is not None:
-        own = samples.xy[np.concatenate(rows)] + network.shift
-        result.distance = np.hypot(*(own - centres).T)
-        result.places = tuple(f"road {road:.0f}, lane {lane:.0f}, s {s:.1f}" for road, lane, s in request)
-    del report
+    if centres is not None and len(centres):
+        result.distance = np.hypot(*(samples.xy[np.concatenate(rows)] + network.shift - centres).T)
+        result.places = tuple(f"road {road}, lane {lane}, s {s:.1f}" for road, lane, s in request)
+        result.reasons = list(_reasons(network, report))
     return result
 
 
-def _carla_centres(path: Path, request: np.ndarray) -> np.ndarray | None:
+def _is_compared(network: Network, key: Key, names: dict[int, str]) -> bool:
+    lane = network.roads[key[0]].sections[key[1]].lanes[key[2]]
+    return lane.kind == LaneType.DRIVING and names[key[0]].isdecimal()
+
+
+def _reasons(network: Network, report: ImportReport) -> Iterator[str]:
+    """Yield the features of a map on which the readers are known to differ."""
+    pieces = [piece for road in network.roads.values() for piece in road.plan if piece.kind == CLOTHOID]
+    lanes = [lane for road in network.roads.values() for section in road.sections for lane in section.lanes.values()]
+    if any(lane.borders for lane in lanes):
+        yield "borders"
+    if any(
+        piece.written_as in ("arc", "spiral")
+        and piece.values[0] == piece.values[1]
+        and (piece.written_as == "spiral" or piece.values[0] == 0.0)
+        for piece in pieces
+    ):
+        yield "an arc of no curvature, or a spiral of constant curvature"
+    if max(map(abs, network.shift)) > FAR:
+        yield "coordinates beyond single precision"
+    for doubt in report.doubts:
+        if "as long as" in doubt or "do not meet" in doubt:
+            yield doubt
+
+
+def _carla_centres(path: Path, request: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
     """Return the centres [n, 2] by carla.Map of lanes by road, lane and s [n, 3]; None if it cannot read the map."""
     with tempfile.TemporaryDirectory() as folder:
         question, answer = Path(folder) / "question.npy", Path(folder) / "answer.npy"
         np.save(question, request)
+        command = [sys.executable, "-c", READER, str(path), str(question), str(answer)]
         try:
-            subprocess.run(
-                [sys.executable, "-c", READER, str(path), str(question), str(answer)],
-                capture_output=True,
-                timeout=TIMEOUT,
-                check=True,
-            )
+            subprocess.run(command, capture_output=True, timeout=TIMEOUT, check=True)
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             return None
-        return np.asarray(np.load(answer))
+        return np.asarray(np.load(answer), np.float64)
 
 
-def summary(folders: dict[str, list[Result]]) -> str:
-    """Return the page: a table of the folders, then the maps that need a word."""
-    lines = [
-        "| Maps of | files | import | share | compared with carla.Map | centres within 0.05 m | longest import, s |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
+def page(folders: dict[str, list[Result]]) -> str:
+    """Return the page on the maps of folders, by names such as owner/repository@commit."""
     everything = [result for results in folders.values() for result in results]
+    rows, errors, differences = [], [], []
     for name, results in [*folders.items(), ("all", everything)]:
         good = [result for result in results if not result.error]
-        compared = [result for result in good if result.distance is not None and np.isfinite(result.distance).any()]
-        close = sum(bool(np.nanmax(result.distance) <= CLOSE) for result in compared)  # type: ignore[arg-type]
-        longest = max((result.seconds for result in good), default=0.0)
-        lines.append(
-            f"| {name} | {len(results)} | {len(good)} | {100 * len(good) / max(len(results), 1):.1f} % |"
-            f" {len(compared)} | {close} | {longest:.1f} |"
+        compared = [result for result in good if result.distance is not None and len(result.distance) > result.missing]
+        repository, _, commit = name.partition("@")
+        cells = (
+            repository,
+            commit[:10],
+            str(len(results)),
+            str(len(good)),
+            f"{100 * len(good) / max(len(results), 1):.1f} %",
+            str(len(compared)),
+            str(sum(result.worst <= CLOSE for result in compared)),
+            f"{max((result.seconds for result in good), default=0.0):.1f}",
         )
-    lines += ["", "Maps that do not import, with the fault of the file:", ""]
-    lines += [f"* {name}: {result.error}" for name, results in folders.items() for result in results if result.error]
-    lines += ["", "Maps with lanes elsewhere than in carla.Map, or that it lacks:", ""]
+        rows.append(f"| {' | '.join(cells)} |")
     for name, results in folders.items():
+        repository = name.partition("@")[0]
         for result in results:
-            if result.distance is None or not len(result.distance):
-                continue
-            missing = int(np.isnan(result.distance).sum())
-            worst = float(np.nanmax(result.distance, initial=0.0))
-            if missing or worst > CLOSE:
-                where = result.places[int(np.nanargmax(result.distance))] if worst > CLOSE else ""
-                away = f"{int((result.distance > CLOSE).sum())} of {len(result.distance)} samples up to {worst:.2f} m away ({where})"
-                lines.append(
-                    f"* {name}, {result.path.name}: {away if worst > CLOSE else ''}{', ' if missing and worst > CLOSE else ''}{f'{missing} samples that it lacks' if missing else ''}"
-                )
-    return "\n".join(lines) + "\n"
+            if result.error:
+                errors.append(f"* {repository}: {result.error}")
+            elif result.worst > CLOSE or result.missing:
+                differences.append(f"* {repository}, {result.path.name}: {_difference(result)}")
+    return PAGE.format(close=CLOSE, rows="\n".join(rows), errors="\n".join(errors), differences="\n".join(differences))
+
+
+def _difference(result: Result) -> str:
+    """Return a sentence on where a map differs from carla.Map's."""
+    parts = []
+    if result.distance is not None and result.worst > CLOSE:
+        place = result.places[int(np.nanargmax(result.distance))]
+        count = int((result.distance > CLOSE).sum())
+        parts.append(f"{count} of {len(result.distance)} samples up to {result.worst:.2f} m away ({place})")
+    if result.missing:
+        parts.append(f"{result.missing} samples that carla.Map lacks")
+    return ", ".join(parts) + (f". In the file: {'; '.join(result.reasons)}" if result.reasons else "")
 
 
 def main(out: str, *folders: str) -> None:
-    """Check the maps of folders and write the page."""
+    """Check the maps of NAME=FOLDER arguments and write the page."""
     results: dict[str, list[Result]] = {}
-    for folder in folders:
+    for argument in folders:
+        name, _, folder = argument.rpartition("=")
         paths = [path for path in sorted(Path(folder).rglob("*.xodr")) if path.stat().st_size]
-        results[Path(folder).name] = []
+        name = name or Path(folder).name
+        results[name] = []
         for number, path in enumerate(paths, 1):
-            results[Path(folder).name].append(check_map(path))
-            print(f"{folder}: {number} of {len(paths)}", end="\r", file=sys.stderr)
-    write_atomic(Path(out), summary(results))
+            results[name].append(check_map(path))
+            print(f"{name}: {number} of {len(paths)}", file=sys.stderr)
+    write_atomic(Path(out), page(results))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.folders import path_inside
 from ssad.core.traces import load_trace
 from ssad.core.types import EpisodeTrace
 from ssad.experiments.runs import summary, write_report
@@ -53,7 +54,7 @@ class Results(Run):
         """Pictures of the run: those of its report, and those that its cells name."""
         cell_paths = [path for row in self.rows for path in (row.get("hashes") or {}) if path.endswith(PICTURES)]
         report_paths = sorted(p for p in (self.folder / "pictures").glob("*") if p.suffix in PICTURES)
-        return tuple(dict.fromkeys([*report_paths, *(self.folder / path for path in cell_paths)]))
+        return tuple(dict.fromkeys([*report_paths, *(path_inside(self.folder, path) for path in cell_paths)]))
 
     def find(self, cell: str) -> Mapping[str, Any]:
         """Return the row of one cell.
@@ -78,14 +79,14 @@ class Results(Run):
 
         Raises:
             ConfigError: There is no such cell.
-            StoreError: The cell left no trace.
+            StoreError: The cell left no trace, or its path leads out of the folder.
             FormatError: The file is broken.
         """
         row = self.find(cell)
         path = (row.get("artefacts") or {}).get("trace")
         if path is None:
             raise StoreError(f"{self.folder}: cell {row['key']} has no trace: {row['reason'] or 'it is no drive'}")
-        return load_trace(self.folder / path)
+        return load_trace(path_inside(self.folder, path))
 
     def traces(self) -> Iterator[EpisodeTrace]:
         """Yield the traces of all drives, in the order of the rows; each is read on demand."""

@@ -130,7 +130,7 @@ def test_a_contact_sheet_shows_the_shifts_that_are_named(tiny_set: Path, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (("shift", "nowhere", "out"), ("nowhere", "no such folder")),
+        (("shift", "nowhere", "out"), ("nowhere", "no such file or folder")),
         (("shift", "{tiny}", "{tmp}/o", "--shifts", "fgo"), ("unknown shift 'fgo'", "closest: fog")),
         (("shift", "{tiny}", "{tmp}/o", "--severity", "6"), ("from 1 to 5",)),
         (("shift", "{tiny}", "{tmp}/o", "--calibration", "real"), ("calibration",)),

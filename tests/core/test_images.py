@@ -144,3 +144,13 @@ def test_pictures_are_saved_by_the_name_of_the_file(tmp_path: Path) -> None:
         save_picture(tmp_path / "a.gif", image)
     with pytest.raises(StoreError):
         save_picture(tmp_path / "a.jpg" / "b.png", image)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_image_that_was_read_can_be_drawn_on(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "image.png"
+    cv2.imwrite(str(path), np.zeros((9, 16, channels), np.uint8))
+    image = read_image(path)
+    image[0, 0] = (1, 2, 3)
+    assert image.shape == (9, 16, 3)
+    assert image[0].sum() == 6

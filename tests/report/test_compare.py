@@ -118,7 +118,9 @@ def test_systems_of_one_run_are_compared_by_name(tmp_path: Path):
     assert comparison.table.rows[0].cells[2].mean == pytest.approx(0.25)
     assert comparison.findings[0].startswith("autopilot → mine: CR 0.20 → 0.45")
     assert comparison.remarks == []
-    shown = CliRunner().invoke(app, ["compare", str(folder), "--pair", "mine=autopilot", "--out", str(tmp_path)])
+    shown = CliRunner().invoke(
+        app, ["compare", str(folder), "--pair", "mine=autopilot", "--out", str(tmp_path / "out")]
+    )
     assert shown.exit_code == 0, shown.output
     assert "mine → autopilot" in shown.output
 
@@ -132,7 +134,7 @@ def test_what_only_one_run_has_is_said_first(tmp_path: Path):
         f"Only {comparison.second.label} has mine: compared with nothing.",
         "To compare two systems of different names: --pair autopilot=mine.",
     ]
-    shown = CliRunner().invoke(app, ["compare", str(first), str(second), "--out", str(tmp_path)]).output
+    shown = CliRunner().invoke(app, ["compare", str(first), str(second), "--out", str(tmp_path / "out")]).output
     assert shown.index("compared with nothing") < shown.index("blind"), "before the table, which names who is compared"
     (paired,) = compare_runs([first, second], ["autopilot=mine", "blind=blind"])
     assert [row.head[0] for row in paired.table.rows if row.head[2] == "CR"] == ["autopilot → mine", "blind"]

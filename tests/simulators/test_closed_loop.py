@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.source import source_version
 from ssad.simulators import closed_loop
 from ssad.simulators.closed_loop import system_version, town_version, type_version
 
@@ -49,9 +51,12 @@ def test_a_system_must_have_its_methods(monkeypatch: pytest.MonkeyPatch) -> None
         system_version("nobody")
 
 
-def test_a_scenario_type_of_ones_own_has_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(closed_loop, "source_version", lambda module: f"version of {module}")
-    assert type_version("own.module:Type") == "version of own.module"
+def test_a_scenario_type_of_ones_own_has_a_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_scenarios.py").write_text(
+        "from ssad.scenarios.dynamic.knowledge.right_turn import SCENARIO as MINE\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert type_version("own_scenarios:MINE") == source_version("own_scenarios")
     assert type_version("StraightObstacle") == ""
 
 

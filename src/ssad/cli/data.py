@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.options import Ray, Workers
 from ssad.core.errors import ConfigError
 
@@ -60,13 +61,18 @@ def shift(
 
     To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
     """
+    is_sheet = source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg")
+    if not verify:
+        paths.check_exists(source)
+        if not (is_sheet or source.resolve() in (out.resolve(), *out.resolve().parents)):
+            paths.check_out(out, paths.SHIFTED, option="OUT")
     from ssad.cli.shift import shift_folder, shift_picture_folder, verify_folder, write_contact_sheets
 
     if verify:
         raise typer.Exit(verify_folder(out))
     names = [name.strip() for name in shifts.split(",") if name.strip()]
     scene_names = [name.strip() for name in scenes.split(",") if name.strip()]
-    if source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg"):
+    if is_sheet:
         write_contact_sheets(
             source,
             out,
@@ -139,6 +145,7 @@ def score(
 
     A shifted folder is first checked against its manifest, so that clean data cannot be scored as shifted.
     """
+    paths.check_exists(dataroot / version, results)
     from rich.console import Console
 
     from ssad.cli.shift import checked
@@ -188,6 +195,7 @@ def record(
     ray: Ray = None,
 ) -> None:
     """Record drives with the nuScenes sensors as a dataset in the nuScenes schema. To resume, repeat the command."""
+    paths.check_out(out, paths.RECORDING, option="OUT")
     from rich.console import Console
 
     from ssad.core.machine import pick_device

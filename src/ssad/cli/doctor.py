@@ -97,12 +97,12 @@ def _torch() -> Finding:
 
 def _carla() -> Finding:
     if importlib.util.find_spec("carla") is None:
-        problem = f"`ssad import map` needs it, and Python 3.11 or 3.12; {install_extra('carla')}"
+        problem = f"CARLA as the simulator needs it, and Python 3.11 or 3.12; {install_extra('carla')}"
         return Finding("carla", "missing", problem)
     try:
-        return Finding("carla", "ok", f"{version('carla')}: `ssad import map` works")
+        return Finding("carla", "ok", f"{version('carla')}: CARLA can be the simulator")
     except PackageNotFoundError:
-        return Finding("carla", "ok", "`ssad import map` works")
+        return Finding("carla", "ok", "CARLA can be the simulator")
 
 
 def _home() -> Finding:

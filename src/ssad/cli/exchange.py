@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.importing import check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
@@ -26,6 +27,10 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_TEXTURE, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
@@ -42,6 +47,10 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and the picture that a projector shows."""
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_out(out, paths.EXPORTED_LIGHT, option="OUT")
     from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
@@ -68,6 +77,7 @@ def import_map(
 
     A page with this report and a picture from above is written too.
     """
+    paths.check_exists(file)
     from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
@@ -139,6 +149,7 @@ def import_drive(
 
     Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
     """
+    paths.check_exists(root)
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
     from ssad.scenarios.dynamic import save_scenarios

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from ssad.cli import paths
 from ssad.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def export_scenarios(
 
     The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
     """
+    paths.check_out(out, paths.EXPORTED_SCENARIOS, option="OUT")
     from ssad.interchange.export import export_commonroad, export_openscenario
     from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios
@@ -84,6 +86,7 @@ def import_openscenario(
     ] = None,
 ) -> None:
     """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    paths.check_exists(file)
     from ssad.interchange.openscenario_reader import read_openscenario
     from ssad.scenarios.dynamic import save_scenarios
 
@@ -103,6 +106,7 @@ def import_leaderboard(
 
     Routes without scenarios become free drives in natural traffic. Their towns must be imported before they are driven.
     """
+    paths.check_exists(file)
     from rich.console import Console
 
     from ssad.engine.progress import LiveProgress
@@ -131,6 +135,7 @@ def import_commonroad(
     XML 2018b and protobuf need the extra `commonroad`. Lanelets that are no town's yet are stored as a town beside
     OUT.yaml too.
     """
+    paths.check_exists(file)
     from ssad.interchange.commonroad_reader import read_commonroad
     from ssad.scenarios.dynamic import save_scenarios
 

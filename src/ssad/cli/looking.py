@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.options import Device
 from ssad.core.errors import ConfigError
 
@@ -22,7 +23,7 @@ def detect(
     detector: Annotated[
         str | None,
         typer.Option(
-            help="Name, or module:object (see: ssad list detectors).  [default: yolov5n; of a folder fcos3d-light]"
+            help="Name, onnx:FILE or module:object (see: ssad list detectors).  [default: yolov5n; folder: fcos3d-light]"
         ),
     ] = None,
     weights: Annotated[Path | None, typer.Option(help="File of weights.  [default: the shipped ones]")] = None,
@@ -38,6 +39,8 @@ def detect(
 
     OUT/results.json is the results file of the official nuScenes detection task, which `ssad score` reads too.
     """
+    paths.check_exists(*sources, weights)
+    paths.check_out(out, paths.DETECTIONS, option="OUT")
     from rich.console import Console
 
     from ssad.core.machine import pick_device
@@ -114,6 +117,8 @@ def show(
 
     Of pictures that are no nuScenes folder, the page shows each upright. Exit code 1: some cannot be read.
     """
+    paths.check_exists(root)
+    paths.check_out(out, paths.PAGE, option="OUT")
     from rich.console import Console
 
     from ssad.datasets.browse import check_scenes, write_page

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.options import Device
 from ssad.core.errors import ConfigError
 
@@ -43,6 +44,8 @@ def plan(
     that needs depends on the flip rate, the share of the cases in which one of two systems has the event, and on how
     alike the cases of a cluster are. Both are measured, in runs of your own or in those of the shipped systems.
     """
+    paths.check_exists(*(runs or []))
+    paths.check_named_files(suite, settings or [])
     from ssad.cli.forecast import forecast
     from ssad.engine.kind import Resources
     from ssad.experiments.sample_size import check_rates, detection_lines, sample_line

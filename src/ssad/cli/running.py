@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ssad.cli import paths
 from ssad.cli.options import Device, Dir, Ray, Workers
 from ssad.core.errors import ConfigError
 
@@ -26,7 +27,9 @@ def run(
     suite: Annotated[
         str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
     ],
-    out: Annotated[Path | None, typer.Option(help="Results folder.  [default: runs/SUITE]")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Results folder: new, empty, or that of the same run.  [default: runs/SUITE]")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the suite; can be repeated."),
@@ -57,6 +60,9 @@ def run(
 
     Exit code 0: every cell ran. 1: some cells failed; the results give the reasons. 2: invalid input.
     """
+    if not (print_config or dry_run):
+        paths.check_out(out or Path("runs") / Path(suite).stem, paths.RUN)
+    paths.check_named_files(suite, settings or [])
     from rich.console import Console
 
     from ssad.engine.kind import Resources
@@ -166,6 +172,8 @@ def compare(
 
     One DIR is enough where --pair names two of its systems.
     """
+    paths.check_exists(*folders)
+    paths.check_out(out, paths.COMPARISON)
     from rich.console import Console
 
     from ssad.report.compare import write_comparison
@@ -210,6 +218,11 @@ def replay(
     driver saw them, beside the same drive without the perturbation.
     Exit code 1: the new run differs from the record.
     """
+    from ssad.engine.store import read_run
+
+    read_run(folder)
+    paths.check_exists(wear)
+    paths.check_out(out, paths.REPLAYS)
     from ssad.core.images import save_picture
     from ssad.core.safeio import make_folder
     from ssad.core.traces import save_trace

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli import paths
+
 Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
 Changes = Annotated[
     list[str] | None,
@@ -42,6 +44,8 @@ def train_detector(
     ] = None,
 ) -> None:
     """Train a detector and validate it on the split val. To resume, repeat the command."""
+    paths.check_exists(data, *(more or []), val_data, weights)
+    paths.check_out(out, paths.TRAINING)
     from ssad.training.detector import DetectorPlan, parse_changes, run_training
 
     plan = DetectorPlan(
@@ -81,6 +85,8 @@ def train_driver(
     ] = None,
 ) -> None:
     """Train a driving system by reinforcement learning (needs the extra train). To resume, repeat the command."""
+    paths.check_exists(start)
+    paths.check_out(out, paths.TRAINING)
     from ssad.training.detector import parse_changes
     from ssad.training.driver import DriverPlan, run_driver_training
 
@@ -116,6 +122,7 @@ def train_adversary(
     seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
 ) -> None:
     """Train an adversary against a driving system (needs the extra train). To resume, repeat the command."""
+    paths.check_out(out, paths.TRAINING)
     from ssad.training.adversary import AdversaryPlan, run_adversary_training
     from ssad.training.detector import parse_changes
 

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
+MAX_MESSAGE = 2000  # characters
+
 
 class SSADError(Exception):
     """An error that the user can fix; the base of all errors below.
@@ -17,11 +19,15 @@ class SSADError(Exception):
     The command line prints the message alone and ends with exit code 2.
 
     Args:
-        message: The problem, its place (file, line, key), and the remedy. It becomes one line.
+        message: The problem, its place (file, line, key), and the remedy. It becomes one line that can be printed; of
+            one longer than `MAX_MESSAGE`, as values of broken files can make it, the middle is left out.
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        line = " ".join(message.split()).encode(errors="backslashreplace").decode()
+        if len(line) > MAX_MESSAGE:
+            line = f"{line[: MAX_MESSAGE // 2]} ... {line[5 - MAX_MESSAGE // 2 :]}"
+        super().__init__(line)
 
 
 class ConfigError(SSADError):

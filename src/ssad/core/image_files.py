@@ -90,7 +90,8 @@ class ImageFile:
     def rgb(self) -> U8:
         """The upright pixels as uint8 [H, W, 3]; 16 bits are rounded to 8, grey is repeated."""
         pixels = to_8_bits(self.pixels)
-        return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
+        # Not `broadcast_to`, whose result is read-only: images are drawn on and handed to torch.
+        return np.ascontiguousarray(pixels) if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
 
     @property
     def has_16_bits(self) -> bool:
@@ -226,7 +227,12 @@ def _pnm_maximum(data: bytes) -> int:
 
 def _decode_16_bits(data: bytes, name: str, file_format: str) -> npt.NDArray[np.uint16]:
     """Return uint16 [H, W] or [H, W, C], RGB or RGBA."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    log_level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it reports broken files on standard error
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
     if pixels is None or pixels.dtype != np.uint16 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
         raise FormatError(f"{name}: 16 bits a channel in a layout that is not supported; save it as PNG")
     if file_format == "PPM":

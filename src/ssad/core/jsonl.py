@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import path_inside
 from ssad.core.seals import CHANGED, SEAL, seal_problem, unsealed
 
 REMEDY = "restore the file from a copy, or run again into another folder"
@@ -42,10 +43,11 @@ def scan_lines(path: str | Path) -> JsonLines:
     """Return the records of a JSONL file and what follows them; a missing file has none. Seals are not checked.
 
     Raises:
-        StoreError: A line before the last is broken, or is no record with a key; a number is NaN or infinite.
+        StoreError: A line before the last is broken, or is no record with a key; a number is NaN or infinite; the
+            file is a link that leads out of its folder.
     """
     lines = JsonLines(Path(path))
-    if not lines.path.exists():
+    if not path_inside(lines.path.parent, lines.path.name).exists():
         return lines
     *complete_lines, remainder = safeio.read_bytes(path, limit=1 << 34).split(b"\n")
     records: list[dict[str, Any]] = []

@@ -15,6 +15,7 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import StoreError
+from ssad.core.folders import path_inside
 from ssad.core.jsonl import REMEDY, JsonLines, check_lines, scan_lines, shown
 from ssad.core.seals import SEAL, content_digest, unsealed
 
@@ -213,7 +214,7 @@ def _check_count(lines: JsonLines, counts: Mapping[str, int] | None) -> None:
 
 
 def _read_counts(folder: Path) -> dict[str, int] | None:
-    path = folder / COUNTS
+    path = path_inside(folder, COUNTS)
     if not path.exists():
         return None
     counts = safeio.read_json(path)

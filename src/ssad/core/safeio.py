@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.folders import check_links_above
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 MIB = 1 << 20
 MAX_DEPTH = 64
 MAX_ALIASED_NODES = 10_000
+MAX_JSON_DEPTH = 100
+MAX_DIGITS = 300  # of a whole number, which must fit a float
 
 Location = Sequence[str | int]
 
@@ -189,11 +192,15 @@ class _Builder:
             if scalar_type == "bool" and text.lower() in ("true", "false"):
                 return text.lower() == "true"
             if scalar_type == "int":
+                if len(text) > MAX_DIGITS:
+                    raise self.error(node, f"a number of {len(text)} digits")
                 return int(text, 0 if text[:2] in ("0o", "0x") else 10)
             if scalar_type == "float":
                 value = float(re.sub(r"\.(?=[in])", "", text.lower()))  # .inf and .nan have a leading dot
                 if math.isnan(value):
                     raise self.error(node, "NaN is not a value")
+                if math.isinf(value) and "inf" not in text.lower():
+                    raise self.error(node, f"{text[:40]} is too large for a number")
                 return value
         except ValueError:
             raise self.error(node, f"'{text[:40]}' is not a valid {scalar_type}") from None
@@ -279,6 +286,46 @@ def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a JSON number")
 
 
+_LONG_NUMBER = re.compile(r"[0-9]{300}|[eE]\+?[0-9]{3}")
+_JSON_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+_BRACKETS = np.zeros(256, np.int8)
+_BRACKETS[list(b"[{")], _BRACKETS[list(b"]}")] = 1, -1
+
+
+def _parse_finite_int(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _parse_finite_float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{text[:40]} is too large for a number")
+    return value
+
+
+def _json_depth(text: str | bytes) -> int:
+    """Return the number of nested lists and objects of a JSON text, at least where it is beyond the limit.
+
+    Python's reader recurses in C, and what reads its result recurses in Python.
+    """
+    for without_strings in (False, True):  # brackets in strings are rare: look closer only if there are too many
+        if without_strings:
+            text = _JSON_STRING.sub("", text if isinstance(text, str) else text.decode(errors="replace"))
+        if isinstance(text, str):
+            brackets = np.frombuffer(text.encode(errors="replace"), np.uint8)
+        else:
+            brackets = np.frombuffer(text, np.uint8)
+        depth, deepest = 0, 0
+        for start in range(0, len(brackets), MIB):
+            depths = depth + np.cumsum(_BRACKETS[brackets[start : start + MIB]], dtype=np.int32)
+            depth, deepest = int(depths[-1]), max(deepest, int(depths.max()))
+        if deepest <= MAX_JSON_DEPTH:
+            break
+    return deepest
+
+
 def parse_json(text: str | bytes, name: str = "<text>") -> Any:
     """Return the plain data of a JSON text; duplicate keys and NaN are refused.
 
@@ -286,7 +333,12 @@ def parse_json(text: str | bytes, name: str = "<text>") -> Any:
         FormatError: It is not valid JSON, with the line.
     """
     try:
-        return json.loads(text, object_pairs_hook=_refuse_duplicate_keys, parse_constant=_refuse_constant)
+        if _json_depth(text) > MAX_JSON_DEPTH:
+            raise FormatError(f"{name}: nested deeper than {MAX_JSON_DEPTH} levels")
+        hooks: dict[str, Any] = {}
+        if _LONG_NUMBER.search(text if isinstance(text, str) else text.decode(json.detect_encoding(text))):
+            hooks = {"parse_int": _parse_finite_int, "parse_float": _parse_finite_float}  # slower than json's own
+        return json.loads(text, object_pairs_hook=_refuse_duplicate_keys, parse_constant=_refuse_constant, **hooks)
     except json.JSONDecodeError as error:
         raise FormatError(f"{name}:{error.lineno}: not valid JSON: {error.msg}") from None
     except (ValueError, RecursionError) as error:
@@ -430,9 +482,10 @@ def make_folder(path: str | Path) -> Path:
     """Create a folder with its parents, and check that it is writable.
 
     Raises:
-        StoreError: It cannot be created or written to.
+        StoreError: It cannot be created or written to, or a link below a results folder leads to it.
     """
     folder = Path(path)
+    check_links_above(folder, itself=True)
     probe = _temporary(folder / "probe")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -456,9 +509,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` (same suffix) that replaces it if the block succeeds.
 
     Raises:
-        StoreError: The file cannot be written.
+        StoreError: The file cannot be written, or a link below a results folder leads to it.
     """
     target = Path(path)
+    check_links_above(target)
     temporary = _temporary(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -125,7 +125,8 @@ def detect_images(
     duplicate = next((stem for stem, count in counts.items() if count > 1), None)
     if duplicate is not None and root is None:
         raise ConfigError(f"two pictures are called {duplicate}; give them to two commands with two OUT folders")
-    make_folder(out)
+    # First, so that the folder of a stopped command is known as its own.
+    write_atomic(make_folder(out) / "detections.json", "{}\n")
     annotated_images, rows_by_file = [], {}
     for file, key, stem in zip(files, keys, stems, strict=True):
         path = out / f"{stem if counts[stem] == 1 else key}.jpg"

@@ -18,17 +18,18 @@ from typing import Any, Self
 
 from ssad.core import safeio
 from ssad.core.errors import StoreError
+from ssad.core.folders import RUN_FILE, check_output_folder, check_tree, open_inside, path_inside
 from ssad.core.run_records import COUNTS, EPISODES, RESULTS, counts_text, read_records
 from ssad.core.seals import sealed
 
-RUN, LOCK = "run.json", ".lock"
+RUN, LOCK = RUN_FILE, ".lock"
 
 Retry = bool | Collection[str]  # whether all failed cells are retried, or the keys of those that are
 
 
 def read_run(folder: str | Path) -> dict[str, Any]:
     """Return run.json of a results folder. StoreError if the folder holds no run."""
-    path = Path(folder) / RUN
+    path = path_inside(folder, RUN)
     if not path.is_file():
         raise StoreError(f"{folder}: not a results folder (it has no {RUN}); make one with: ssad run SUITE --out DIR")
     content = safeio.read_json(path)
@@ -62,7 +63,8 @@ class Store:
             command: The command, for messages.
 
         Raises:
-            StoreError: The folder cannot be written, is in use, or belongs to another run; nothing is changed then.
+            StoreError: The folder cannot be written, is in use, belongs to another run or holds something else, or a
+                link in it leads out of it; nothing is changed then.
         """
         path = Path(folder)
         _check_content(path, run, command)
@@ -91,7 +93,7 @@ class Store:
         if self._is_sealed:
             # Before the files get shorter: lines that are counted and not there would count as removed.
             safeio.write_atomic(self.folder / COUNTS, counts_text(self._counts))
-            self._files[COUNTS] = _open(self.folder / COUNTS, os.O_RDWR)
+            self._files[COUNTS] = open_inside(self.folder, COUNTS, os.O_RDWR)
         if self.retried or not records.whole:
             # A kill may leave half a line, and the next line would be appended to it.
             for name, kept_records in ((RESULTS, self.results), (EPISODES, episodes)):
@@ -101,7 +103,7 @@ class Store:
                 ]
                 safeio.write_atomic(self.folder / name, "".join(lines))
         for name in (RESULTS, EPISODES):
-            self._files[name] = _open(self.folder / name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+            self._files[name] = open_inside(self.folder, name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
         """Add a finished cell; the record is durable when this returns.
@@ -163,12 +165,16 @@ def _failed(record: Mapping[str, Any]) -> bool:
 
 def _check_content(folder: Path, run: Mapping[str, Any], command: str) -> None:
     """Refuse a folder that belongs to something else."""
+    option = "--out" if command == "ssad run" else "OUT"
     if folder.exists() and not folder.is_dir():
-        raise StoreError(f"{folder}: is a file; choose a folder with --out")
+        raise StoreError(f"{folder}: is a file; choose a folder with {option}")
     if not (folder / RUN).exists():
         if (folder / RESULTS).exists():
             raise StoreError(f"{folder}: has {RESULTS} but no {RUN}; choose another folder with --out")
+        check_output_folder(folder, (), option=option)
         return
+    if command == "ssad run":  # shifted folders have links to the data that they are made of
+        check_tree(folder)
     existing = read_run(folder)
     if existing["identity"] == run["identity"]:
         return
@@ -185,10 +191,7 @@ def _check_content(folder: Path, run: Mapping[str, Any], command: str) -> None:
 def _lock(folder: Path, command: str = "ssad run") -> int:
     """The descriptor of a lock file that only one process may hold. StoreError: another one does."""
     path = folder / LOCK
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
+    descriptor = open_inside(folder, LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -218,10 +221,3 @@ def locked(folder: Path, command: str) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _open(path: Path, flags: int) -> int:
-    try:
-        return os.open(path, flags | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror}") from None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import traceback
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import rich.table
@@ -10,6 +12,7 @@ from pydantic import ValidationError
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError, StoreError
+from ssad.core.folders import check_tree
 from ssad.engine.kind import Kind, Plan, Replay
 from ssad.engine.replay import replay_cell
 from ssad.engine.run import run_json
@@ -29,8 +32,10 @@ def read_plan(folder: str | Path) -> Plan:
 
     Raises:
         ConfigError: Code or inputs have changed since.
+        StoreError: The folder holds no run, or something in it leads out of it.
     """
     header = read_run(folder)
+    check_tree(folder)
     try:
         kind = kind_of(str(header["suite"]["kind"]))
         suite, device = kind.suite.model_validate(header["suite"]), str(header["versions"]["device"])
@@ -93,7 +98,8 @@ def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
         StoreError: The folder holds no run, has no results, or cannot be written.
     """
     run = load_run(folder)
-    page, tables = (kind or kind_of_run(run)).page(run)
+    with _read_as_kind(run):
+        page, tables = (kind or kind_of_run(run)).page(run)
     write_tables(run.folder, tables)
     page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
     path = run.folder / "report.html"
@@ -113,8 +119,9 @@ def report_markdown(folders: Sequence[Path | str]) -> str:
     """
     run = join_runs([load_run(folder) for folder in folders])
     kind = kind_of_run(run)
-    _, tables = kind.page(run)
-    return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
+    with _read_as_kind(run):
+        _, tables = kind.page(run)
+        return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
 
 
 def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
@@ -128,4 +135,22 @@ def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
         StoreError: The folder holds no run with results.
     """
     run = load_run(folder)
-    return terminal_table(run, (kind or kind_of_run(run)).summary(run))
+    with _read_as_kind(run):
+        return terminal_table(run, (kind or kind_of_run(run)).summary(run))
+
+
+@contextlib.contextmanager
+def _read_as_kind(run: Run) -> Iterator[None]:
+    """Make an error of a page that is made of a run's records one line: the records may come from anywhere.
+
+    Raises:
+        StoreError: The records are not those of the kind. Its cause is the error, for authors of kinds.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise StoreError(
+            f"{run.folder}: its records are not those of kind {run.kind}: {type(error).__name__}: {error} "
+            f"({Path(place.filename).name}:{place.lineno}); run the suite again"
+        ) from error

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.folders import path_inside
 from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import to_plain_json
@@ -132,7 +133,7 @@ class ScenarioKind(Kind):
         """Drive the episode again and compare every bit of its trace."""
         start_warp_quietly()
         trace = self.drive_again(plan, cell, record)
-        recorded = load_trace(folder / record["artefacts"]["trace"])
+        recorded = load_trace(path_inside(folder, record["artefacts"]["trace"]))
         return Replay(cell, first_difference(recorded, trace), trace, cached_town(trace.town))
 
 

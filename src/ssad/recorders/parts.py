@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_links_above
 from ssad.engine.store import locked
 
 FOLDER: Final = ".parts"
@@ -108,8 +109,9 @@ def claim(path: Path, request: Mapping[str, Any], refusal: str) -> None:
         refusal: Message of the error.
 
     Raises:
-        StoreError: The file holds another request or is damaged, or it cannot be written.
+        StoreError: The file holds another request or is damaged, it cannot be written, or its folder is a link.
     """
+    check_links_above(path, root=path.parent.parent)
     safeio.make_folder(path.parent)
     if not path.exists():
         safeio.write_atomic(path, safeio.dump_json(dict(request), indent=1) + "\n")

@@ -68,12 +68,13 @@ def pick_trace(folder: Path) -> Path | None:
 
     Collisions with walkers come first.
     """
+    from ssad.core.folders import path_inside
     from ssad.core.jsonl import read_lines
 
     candidates = []
     for record in read_lines(folder / "results.jsonl"):
         trace = record.get("artefacts", {}).get("trace", "")
-        if trace and (folder / trace).is_file():
+        if trace and path_inside(folder, trace).is_file():
             collided = bool(record.get("metrics", {}).get("collision"))
             hit_walker = bool(record.get("metrics", {}).get("collisions_walker"))
             # False sorts first; the names make the choice independent of the order of the records.

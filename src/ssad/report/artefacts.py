@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ssad.core import safeio
-from ssad.core.errors import SSADError
+from ssad.core.errors import SSADError, StoreError
+from ssad.core.folders import path_inside
 from ssad.core.traces import load_trace, trace_hash
 from ssad.report.load import Run, load_run
 
@@ -53,12 +54,15 @@ def artefact_problems(run: Run) -> list[str]:
 def pictures(folder: Path) -> list[dict[str, str]]:
     """Return the existing pictures of pictures/pictures.json: file, caption, data (as a data: URI)."""
     picture_folder = folder / "pictures"
-    if not (picture_folder / "pictures.json").is_file():
+    captions_file = path_inside(folder, "pictures/pictures.json")
+    if not captions_file.is_file():
         return []
     entries = []
-    captions = safeio.read_json(picture_folder / "pictures.json")
+    captions = safeio.read_json(captions_file)
+    if not isinstance(captions, dict):
+        raise StoreError(f"{captions_file}: not a mapping from pictures to captions; remove it and run again")
     for file, caption in sorted(captions.items(), key=lambda item: (len(item[0]), item[0])):
-        path = picture_folder / Path(str(file)).name
+        path = path_inside(picture_folder, Path(file).name or "unnamed")
         kind = _PICTURES.get(path.suffix)
         if kind and path.is_file():
             encoded = base64.b64encode(safeio.read_bytes(path)).decode()
@@ -73,9 +77,9 @@ def _paths(artefacts: Mapping[str, Any]) -> Iterator[str]:
 
 def _problem(folder: Path, path: str, digest: str, trace: str) -> str:
     """Return the problem of a file or folder, "" if there is none."""
-    artefact = folder / path
-    # Records may come from anywhere: a path must not lead out of the folder.
-    if not artefact.resolve().is_relative_to(folder.resolve()):
+    try:
+        artefact = path_inside(folder, path)  # records may come from anywhere
+    except StoreError:
         return "lies outside the run folder"
     if not artefact.exists():
         return "is missing"

@@ -14,6 +14,8 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_tree
+from ssad.core.jsonl import shown
 from ssad.core.run_records import RESULTS, read_records
 
 INCIDENTAL = (
@@ -27,6 +29,20 @@ INCIDENTAL = (
     "timeout_s",
     "witness",
 )  # keys of suites that change no result
+
+HEADER_TYPES = {
+    "kind": str,
+    "suite": dict,
+    "command": str,
+    "versions": dict,
+    "code": str,
+    "machine": dict,
+    "columns": list,
+    "factors": list,
+    "cells": list,
+    "commands": list,
+}
+"""Types of the keys of run.json that are used; each may be missing."""
 
 
 @dataclass(frozen=True)
@@ -116,21 +132,40 @@ def _spoken(value: Any) -> str:
     return str(value)
 
 
+def _check_header(path: Path, header: Any) -> None:
+    """Raise StoreError if run.json has a key of another type than `ssad run` writes."""
+    problem = "" if isinstance(header, dict) else "it is no object"
+    for name, kind in HEADER_TYPES.items():
+        if not problem and not isinstance(header.get(name), kind | None):
+            problem = f"{name} is {shown(header[name])}"
+    for name, key in (("cells", "key"), ("columns", "name")):
+        entries = [] if problem else header.get(name) or []
+        for number, entry in enumerate(entries):
+            if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
+                problem = f"{name}[{number}] is {shown(entry)}, without the text {key}"
+                break
+    for name in ("factors", "commands"):
+        if not problem and not all(isinstance(entry, str) for entry in header.get(name) or []):
+            problem = f"{name} is {shown(header[name])}"
+    if problem:
+        raise StoreError(f"{path}: not written by ssad run: {problem}; give a folder written by: ssad run")
+
+
 def load_run(folder: Path | str) -> Run:
     """Read run.json, results.jsonl and episodes.jsonl, and check every line.
 
     A folder whose lines have no seals, such as one of an earlier version, is read with a warning.
 
     Raises:
-        StoreError: The folder does not hold a run, the run has no result yet, or its records fail a check of
-            `ssad.core.run_records.read_records`.
+        StoreError: The folder does not hold a run, something in it leads out of it, the run has no result yet, or its
+            records fail a check of `ssad.core.run_records.read_records`.
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
+    check_tree(folder)
     header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
-    if not isinstance(header, dict):
-        raise StoreError(f"{folder / 'run.json'}: not written by ssad run; give a folder written by: ssad run")
+    _check_header(folder / "run.json", header)
     records = read_records(folder, header)
     if not records.results:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")

@@ -299,7 +299,7 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
         StoreError: A file cannot be written.
     """
     paths = []
-    (folder / "tables").mkdir(parents=True, exist_ok=True)
+    safeio.make_folder(folder / "tables")
     for table in tables:
         for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
             path = folder / "tables" / f"{table.name}.{suffix}"

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from benchmarks.opendrive_maps import check_map
 from ssad.core.errors import MapError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph, SignKind, are_equal
@@ -83,6 +84,17 @@ def check_against_carla(graph: LaneGraph, text: str) -> None:
 def test_baked_lanes_are_where_carla_has_them(carla_home: Path, data_dir: Path, name: str) -> None:
     text = (data_dir / "maps" / f"{name}.xodr").read_text(encoding="utf-8")
     check_against_carla(imported(carla_home, name), text)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", IMPORTED)
+def test_centres_of_carla_towns_are_carlas_to_a_millimetre(data_dir: Path, name: str) -> None:
+    pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")
+    result = check_map(data_dir / "maps" / f"{name}.xodr")
+    assert result.distance is not None
+    assert len(result.distance) > 5000
+    assert not result.missing
+    assert result.worst < 1e-3
 
 
 @pytest.mark.parametrize("name", ["Twinford", "Crossgate", "ProvingGround"])

@@ -16,6 +16,7 @@ import numpy as np
 
 from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
+from ssad.core.folders import is_file_name
 from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.index import Index, open_index
@@ -97,7 +98,15 @@ class NuScenes:
 
     @cached_property
     def _scenes(self) -> list[Scene]:
-        return self._index.rows(Scene)
+        scenes = self._index.rows(Scene)
+        for scene in scenes:
+            self._check_file_name(Scene, scene.token, scene.name)
+        return scenes
+
+    def _check_file_name(self, kind: type[TableRecord], token: str, name: str) -> None:
+        """Raise FormatError for a name that files are named after and that could lead out of their folder."""
+        if not is_file_name(name):
+            raise FormatError(f"{self._path(kind)}: '{token}': '{name[:80]}' cannot be part of a file's name")
 
     @cached_property
     def _sensors(self) -> dict[str, Sensor]:
@@ -171,6 +180,8 @@ class NuScenes:
         for row in rows:
             calibration = row.calibrated_sensor_token
             sensor = self._sensor(calibrations[calibration])
+            self._check_file_name(SampleData, row.token, row.token)
+            self._check_file_name(Sensor, sensor.token, sensor.channel)
             # A table may come from anywhere: a path must not lead out of the root.
             if (
                 (relative_path := PurePosixPath(row.filename)).is_absolute()

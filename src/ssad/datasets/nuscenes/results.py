@@ -25,6 +25,7 @@ from ssad.core.boxes import size_columns
 from ssad.core.errors import FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES
 from ssad.core.types import F64, I32
+from ssad.datasets.nuscenes.tables import BROKEN
 from ssad.metrics.detection_boxes import BoxTable
 
 BLOCK: Final = 4 << 20
@@ -142,7 +143,7 @@ def _columns(
     for sample_number, (token, encoded) in enumerate(boxes_by_sample.items()):
         try:
             boxes = decoder.decode(encoded)
-        except msgspec.MsgspecError as error:
+        except BROKEN as error:
             raise FormatError(f"{path}: sample {token}: {_describe_path(error)}") from None
         counts[sample_number] = len(boxes)
         if len(boxes) > max_boxes:
@@ -214,7 +215,7 @@ def _decode(path: str | Path) -> _File:
         return msgspec.json.decode(text, type=_File)
     except msgspec.ValidationError as error:
         raise FormatError(f"{path}: not a results file: {error}") from None
-    except msgspec.MsgspecError as error:
+    except BROKEN as error:
         hint = " (Infinity is not a number that JSON has)" if b"Infinity" in text else ""
         raise FormatError(f"{path}: not valid JSON: {error}{hint}") from None
 
@@ -260,7 +261,7 @@ def _count_quotes(text: bytearray) -> int:
     return (re.sub(rb"\\.", b"", text, flags=re.DOTALL) if b"\\" in text else text).count(b'"')
 
 
-def _describe_path(error: msgspec.MsgspecError) -> str:
+def _describe_path(error: Exception) -> str:
     """Return the message of a msgspec error with its path `$[3].size` in words."""
     message = str(error)
     location = re.search(r" - at `\$(?:\[(\d+|\.\.\.)\])?\.?(.*?)`$", message)

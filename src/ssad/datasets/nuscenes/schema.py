@@ -7,12 +7,15 @@ sizes (width, length, height), times in microseconds. Source: nuscenes.org, sche
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Microseconds = Annotated[int, msgspec.Meta(ge=-(1 << 60), le=1 << 60)]
+Count = Annotated[int, msgspec.Meta(ge=-1, le=(1 << 30) - 1)]
+"""A number of points or pixels; -1 where it is not known. Sums of two fit 32 bits."""
 
 
 class TableRecord(msgspec.Struct, frozen=True, gc=False):
@@ -49,14 +52,14 @@ class EgoPose(TableRecord, frozen=True, gc=False):
 
     translation: Vector
     rotation: Quaternion
-    timestamp: int
+    timestamp: Microseconds
 
 
 class Instance(TableRecord, frozen=True, gc=False):
     """An object followed over a scene."""
 
     category_token: str
-    nbr_annotations: int = 0
+    nbr_annotations: Count = 0
     first_annotation_token: str = ""
     last_annotation_token: str = ""
 
@@ -81,7 +84,7 @@ class Map(TableRecord, frozen=True, gc=False):
 class Sample(TableRecord, frozen=True, gc=False):
     """A key frame, annotated twice a second."""
 
-    timestamp: int
+    timestamp: Microseconds
     scene_token: str
     prev: str = ""
     next: str = ""
@@ -97,8 +100,8 @@ class SampleAnnotation(TableRecord, frozen=True, gc=False):
     translation: Vector
     size: Vector
     rotation: Quaternion
-    num_lidar_pts: int = 0
-    num_radar_pts: int = 0
+    num_lidar_pts: Count = 0
+    num_radar_pts: Count = 0
     prev: str = ""
     next: str = ""
 
@@ -109,12 +112,12 @@ class SampleData(TableRecord, frozen=True, gc=False):
     sample_token: str
     ego_pose_token: str
     calibrated_sensor_token: str
-    timestamp: int
+    timestamp: Microseconds
     is_key_frame: bool
     filename: str
     fileformat: str = ""
-    height: int | None = None
-    width: int | None = None
+    height: Count | None = None
+    width: Count | None = None
     prev: str = ""
     next: str = ""
 
@@ -125,7 +128,7 @@ class Scene(TableRecord, frozen=True, gc=False):
     name: str
     log_token: str = ""
     description: str = ""
-    nbr_samples: int = 0
+    nbr_samples: Count = 0
     first_sample_token: str = ""
     last_sample_token: str = ""
 

@@ -13,6 +13,7 @@ from ssad.core.errors import FormatError
 BLOCK = 4 << 20
 LIMIT = 16 * BLOCK  # largest undecoded text, bytes: no record is longer
 _SPACE = b" \t\r\n"
+BROKEN = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)  # what msgspec raises for a broken text
 
 T = TypeVar("T")
 
@@ -56,7 +57,7 @@ def stream(path: Path, kind: type[T], *, block: int = BLOCK) -> Iterator[list[T]
             elements = text[:block_end].lstrip(_SPACE + b",") if text.lstrip(_SPACE)[:1] == b"," else text[:block_end]
             try:
                 records = decoder.decode(b"[" + elements + b"]")
-            except msgspec.MsgspecError:
+            except BROKEN:
                 # cut inside a string or an inner object, or broken: more text decides, the end at the latest
                 if len(text) > LIMIT:
                     raise _error(path, decoder, text, line_number) from None
@@ -76,7 +77,7 @@ def _decode_rest(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes
             raise FormatError(f"{path}:{line}: not valid JSON: a record is missing after the comma")
     try:
         return decoder.decode(b"[" + elements)
-    except msgspec.MsgspecError:
+    except BROKEN:
         raise _error(path, decoder, text, line) from None
 
 
@@ -86,7 +87,7 @@ def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line
     list_text = text.lstrip(_SPACE).removeprefix(b",")
     try:
         elements = msgspec.json.decode(b"[" + list_text, type=list[msgspec.Raw])
-    except msgspec.MsgspecError as error:
+    except BROKEN as error:
         message = str(error)
         error_line = line
         if "byte " in message:
@@ -104,7 +105,7 @@ def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line
         offset = text.find(element_text, offset)
         try:
             decoder.decode(b"[" + element_text + b"]")
-        except msgspec.MsgspecError as error:
+        except BROKEN as error:
             error_line = line + text.count(b"\n", 0, offset)
             return FormatError(f"{path}:{error_line}: {str(error).replace('$[...]', 'record')}")
         offset += len(element_text)

@@ -24,6 +24,7 @@ from ssad.datasets.nuscenes.scene import velocities
 from ssad.datasets.nuscenes.schema import (
     Attribute,
     Category,
+    Count,
     Quaternion,
     Sample,
     Scene,
@@ -95,8 +96,8 @@ class _AnnotationRow(msgspec.Struct, gc=False):
     translation: Vector
     size: Vector
     rotation: Quaternion
-    num_lidar_pts: int
-    num_radar_pts: int
+    num_lidar_pts: Count
+    num_radar_pts: Count
     prev: str
     next: str
 

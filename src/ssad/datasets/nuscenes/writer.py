@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 
 from ssad.core.errors import FormatError
+from ssad.core.folders import check_links_above
 from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORIES
 from ssad.core.safeio import atomic_path, dump_json, make_folder, write_atomic
 from ssad.core.seeding import digest
@@ -392,6 +393,7 @@ def place_file(path: Path, data: bytes | Path) -> None:
     source = data.resolve()
     if not source.is_file():
         raise FormatError(f"{data}: no such file to link to")
+    check_links_above(path)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)

@@ -258,7 +258,7 @@ class OnnxYolo(Adapter):
         score = dense.logit.sigmoid()
         if dense.quality is not None:
             score = score * dense.quality.sigmoid()[..., None]
-        label, owner, _, _ = assign_by_alignment(score, dense.box, dense.place, targets)
+        label, owner, _, _ = assign_by_alignment(score, dense.box, dense.place, targets, inside_first=True)
         return Assignment(label, owner, tuple(truth))
 
     def losses(

@@ -199,6 +199,12 @@ def _check_input(onnx: Any, model: Any, path: Path) -> None:
 def _remove_copies(onnx: Any, model: Any) -> None:
     """Let the readers of a copy read the original, and move constants to the weights, where onnx2torch finds them."""
     outputs = {output.name for output in model.graph.output}
+    graph = onnx.shape_inference.infer_shapes(model).graph
+    floats = {
+        value.name
+        for value in (*graph.value_info, *graph.input)
+        if value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT
+    }
     originals: dict[str, str] = {}
     nodes = []
     for node in model.graph.node:
@@ -206,7 +212,9 @@ def _remove_copies(onnx: Any, model: Any) -> None:
             node.input[index] = originals.get(name, name)
         while node.input and not node.input[-1]:
             node.input.pop()  # an option that is not given
-        if node.op_type == "Identity" and node.output[0] not in outputs:
+        # A cast from float32 to float32 would keep a copy of the network in float64 from running.
+        is_copy = node.op_type == "Cast" and node.input[0] in floats and node.attribute[0].i == onnx.TensorProto.FLOAT
+        if (is_copy or node.op_type == "Identity") and node.output[0] not in outputs:
             originals[node.output[0]] = node.input[0]
         elif node.op_type == "Constant" and node.attribute[0].name == "value":
             tensor = onnx.TensorProto.FromString(node.attribute[0].t.SerializeToString())

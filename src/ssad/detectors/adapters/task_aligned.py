@@ -17,7 +17,7 @@ TOP, ALPHA, BETA = 10, 0.5, 6.0  # published hyperparameters of YOLOv8
 
 
 def assign_by_alignment(
-    score: Tensor, box: Tensor, place: Tensor, targets: Targets
+    score: Tensor, box: Tensor, place: Tensor, targets: Targets, *, inside_first: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Assign to each object the ten places inside it with the largest score^0.5 * CIoU^6.
 
@@ -28,13 +28,15 @@ def assign_by_alignment(
         box: Predicted boxes [B, P, 4].
         place: Centres of the cells [P, 2].
         targets: Objects of all images.
+        inside_first: Whether places inside an object come first where no box overlaps it, so that it has some; in the
+            source, any ten of all places are the best then.
 
     Returns:
         Label [B, P] (-1 background, -2 ignored), owner [B, P] (-1 none), box of the owner [B, P, 4] (0 without one),
         and target score [B, P].
     """
     rows = [
-        _assign_image(image_score, image_box, place, targets, index)
+        _assign_image(image_score, image_box, place, targets, index, inside_first=inside_first)
         for index, (image_score, image_box) in enumerate(zip(score, box, strict=True))
     ]
     label, owner, target_box, weight = (torch.stack(column) for column in zip(*rows, strict=True))
@@ -42,7 +44,7 @@ def assign_by_alignment(
 
 
 def _assign_image(
-    score: Tensor, predicted: Tensor, place: Tensor, targets: Targets, image_index: int
+    score: Tensor, predicted: Tensor, place: Tensor, targets: Targets, image_index: int, *, inside_first: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return label, owner, box and weight of the places of an image."""
     object_count = int(targets.real[image_index].sum())
@@ -63,7 +65,8 @@ def _assign_image(
     )
     overlap = overlap * is_inside
     alignment = score[:, object_labels] ** ALPHA * overlap**BETA
-    best_cells = alignment.topk(min(TOP, len(place)), 0).indices
+    ranking = alignment.masked_fill(~is_inside, -1.0) if inside_first else alignment
+    best_cells = ranking.topk(min(TOP, len(place)), 0).indices
     is_claimed = torch.zeros_like(is_inside).scatter_(0, best_cells, True) & is_inside
     claim_overlap = torch.where(is_claimed, overlap, -1.0)
     claim_overlap[is_claimed.sum(1) > 1] = overlap[is_claimed.sum(1) > 1]  # the most overlap of all, as the source does

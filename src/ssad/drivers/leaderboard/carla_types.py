@@ -45,7 +45,7 @@ class TrafficLightState(enum.IntEnum):
     Unknown = 4
 
 
-class LaneType(enum.IntFlag):
+class CarlaLaneType(enum.IntFlag):
     """Kinds of lanes, as carla.LaneType."""
 
     NONE = 1
@@ -191,14 +191,14 @@ class BoundingBox:
         self.location, self.extent = location or Location(), extent or Vector3D()
 
 
-CARLA_TYPES: Final = (
-    VehicleControl,
-    Vector3D,
-    Location,
-    Rotation,
-    Transform,
-    BoundingBox,
-    TrafficLightState,
-    LaneType,
-)
-"""Types that stand in for those of `carla`."""
+CARLA_TYPES: Final = {
+    "VehicleControl": VehicleControl,
+    "Vector3D": Vector3D,
+    "Location": Location,
+    "Rotation": Rotation,
+    "Transform": Transform,
+    "BoundingBox": BoundingBox,
+    "TrafficLightState": TrafficLightState,
+    "LaneType": CarlaLaneType,
+}
+"""Types that stand in for those of `carla`, by their name there."""

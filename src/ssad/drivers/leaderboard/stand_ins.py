@@ -23,7 +23,7 @@ def install_stand_ins() -> None:
     _offer("agents.navigation.basic_agent", BasicAgent=BasicAgent)
     _offer("srunner.scenariomanager.carla_data_provider", CarlaDataProvider=CarlaDataProvider)
     _offer("srunner.scenariomanager.timer", GameTime=GameTime)
-    _offer("carla", **{kind.__name__: kind for kind in CARLA_TYPES})
+    _offer("carla", **CARLA_TYPES)
 
 
 def _offer(name: str, **content: Any) -> None:

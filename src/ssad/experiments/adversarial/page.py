@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 
 from ssad.core.errors import SSADError
+from ssad.core.folders import path_inside
 from ssad.core.lane_graph import load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.experiments.adversarial.collision_view import draw_collision
@@ -252,7 +253,7 @@ def collision_views(run: Run) -> list[dict[str, str]]:
     entries = []
     for (generator, system, _), line in list(lines_by_group.items())[:VIEWS]:
         try:
-            trace = load_trace(run.folder / line["artefacts"]["trace"])
+            trace = load_trace(path_inside(run.folder, line["artefacts"]["trace"]))
             graph = load_graph(run.folder / "towns" / town_file(trace.town))
         except SSADError:
             continue  # named on the page as missing or damaged

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ssad.core.errors import SSADError, StoreError
+from ssad.core.folders import path_inside
 from ssad.core.lane_graph import LaneGraph, load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.core.types import EpisodeTrace
@@ -48,7 +49,7 @@ def replay_data(run: DrivingRun) -> dict[str, Any]:
     for record in run.records:
         if record.trace:
             try:
-                traces[record.key] = load_trace(run.folder / record.trace)
+                traces[record.key] = load_trace(path_inside(run.folder, record.trace))
             except SSADError as error:
                 missing[record.key] = str(error)
     graphs: dict[str, LaneGraph] = {}

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
+from ssad.core.folders import path_inside
 from ssad.core.images import save_picture
 from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE, SHARE
@@ -236,7 +237,7 @@ class Gap(ScenarioKind):
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
         """Drive the episode again and compare every bit of its trace; film it beside the clean drive."""
         start_warp_quietly()
-        recorded = load_trace(folder / record["artefacts"]["trace"])
+        recorded = load_trace(path_inside(folder, record["artefacts"]["trace"]))
         spec, graph = cell.spec, cached_town(recorded.town)
         # The clean drive shows what the perturbation alone changes.
         clean_cell = replace(cell, spec={**spec, "perturbation": None})

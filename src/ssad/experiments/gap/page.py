@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from ssad.core import safeio
+from ssad.core.folders import path_inside
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.rank import family_correlation
@@ -312,13 +313,13 @@ def sheets(run: Run) -> list[dict[str, str]]:
     candidates: list[tuple[int, int, Line, str]] = []
     for line in sorted(run.lines, key=lambda line: not (line.get("metrics") or {}).get("collision")):
         path = (line.get("artefacts") or {}).get("sheet")
-        if path and (run.folder / path).is_file():
+        if path and path_inside(run.folder, path).is_file():
             condition = (line["system"], line["perturbation"], int(line["severity"]))
             sheets_by_condition[condition] += 1
             candidates.append((sheets_by_condition[condition], len(candidates), line, path))
     entries = []
     for _, _, line, path in sorted(candidates, key=lambda candidate: candidate[:2])[:sheet_limit]:
-        encoded = base64.b64encode(safeio.read_bytes(run.folder / path)).decode()
+        encoded = base64.b64encode(safeio.read_bytes(path_inside(run.folder, path))).decode()
         cause = (line.get("cause") or {}).get("cause", "")
         condition_text = f"{line['perturbation']} {line['severity']}" if line["severity"] else "clean"
         outcome = str(line.get("end", "")).replace("_", " ")

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError, SSADError, StoreError
+from ssad.core.folders import check_links_above
 from ssad.core.frames import Camera, Frame, ShiftReport, SweepFrame
 from ssad.core.image_files import FORMAT_NAMES, check_writable, encode_like, read_image_file
 from ssad.core.machine import start_warp_quietly
@@ -165,7 +166,10 @@ def shift_pictures(
             for file in selected_files
         ]
         for root in conditions:
-            check_folders(root, {os.path.dirname(file.key) for file in files}, source)
+            folder_names = {os.path.dirname(file.key) for file in files}
+            check_folders(root, folder_names, source)
+            for folder_name in folder_names:
+                check_links_above(root / folder_name, root=out, itself=True)
         for folder in {task.target.parent for task in tasks}:
             remove_unfinished(folder)
         missing = [task for task in tasks if _task_name(task) not in store.results or not _is_written(task)]
@@ -285,6 +289,8 @@ def camera_of(path: Path, image: U8) -> Camera:
             try:
                 matrix = np.array(matrix_text.split(), np.float64).reshape(3, 4)[:, :3]
             except ValueError:
+                break
+            if not np.isfinite(matrix).all():
                 break
             return replace(camera, intrinsic=matrix)
     raise ConfigError(f"{calibration}: no line '{matrix_name}:' with 12 numbers")

@@ -16,6 +16,7 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import check_links_above, open_inside
 from ssad.core.frames import ShiftReport
 from ssad.core.image_files import check_writable, encode_like, turn_upright
 from ssad.core.images import annotation_orientation
@@ -25,6 +26,7 @@ from ssad.datasets.nuscenes.files import read_frame_file
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.tables import BROKEN
 from ssad.datasets.point_files import encode_points_like, read_point_file
 from ssad.recorders.shifted.manifest import (
     FOLDER,
@@ -66,7 +68,7 @@ def read_finished_labels(root: Path, scene: str) -> SceneLabels | None:
         encoded = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
         labels = msgspec.json.decode(encoded, type=SceneLabels)
         return labels if labels.lines == digest_file(shard_path(root, scene)) else None
-    except (FormatError, msgspec.MsgspecError):
+    except (FormatError, *BROKEN):
         return None  # missing or damaged: the scene is checked again
 
 
@@ -150,11 +152,10 @@ def check_folders(root: Path, folders: Iterable[str | Path], source: Path) -> No
 @contextlib.contextmanager
 def _open_for_append(path: Path) -> Iterator[RawIOBase]:
     """Open a file to append whole lines; it is on disk when the block ends."""
-    try:
-        stream = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
-    except OSError as error:
-        raise _write_error(path, error) from None
-    with stream:
+    descriptor = open_inside(
+        path.parent.parent, f"{path.parent.name}/{path.name}", os.O_WRONLY | os.O_APPEND | os.O_CREAT
+    )
+    with open(descriptor, "ab", buffering=0) as stream:
         if stream.tell():
             _append(path, stream, None)  # ends a line that a kill may have truncated
         yield stream
@@ -334,6 +335,8 @@ def _write(root: Path, target: Path, data: bytes) -> None:
 def _replacement_path(root: Path, target: Path) -> Iterator[Path]:
     """Yield a path in the folder of unfinished files that replaces `target` if the block succeeds. StoreError."""
     temporary = _temporary(root)
+    check_links_above(target, root=root)
+    check_links_above(temporary, root=root)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.parent.mkdir(exist_ok=True)

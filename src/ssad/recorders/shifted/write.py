@@ -14,6 +14,7 @@ import msgspec
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.folders import check_links_above
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
@@ -130,6 +131,7 @@ def _open_root(options: Options, shift: str, severity: Strength, source: dict[st
     check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
     identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
     refusal = f"{root}: holds a shift of other data or options; choose another folder"
+    check_links_above(root, root=options.out, itself=True)
     claim(root / FOLDER / "identity.json", identity, refusal)
     try:
         (root / PAGE).unlink(missing_ok=True)  # the root is incomplete until this run finishes it

@@ -21,6 +21,7 @@ STEP = 0.5  # m between samples
 NUDGE = 1e-3  # m, so that a sample belongs to its own section
 GAP = 0.05  # m between two pieces of a reference line that is worth a word
 LENGTH_ERROR = 0.01  # share of its length by which a polynomial curve may be longer or shorter than the file says
+LONG_ERROR = 0.1  # m, the same for long curves
 
 Key = tuple[int, int, int]  # road, section, lane id
 
@@ -70,7 +71,7 @@ class LaneSampler:
             if gap > GAP:
                 report.doubt("the pieces of a reference line do not meet", f"road {roads[row]}, s {s:.1f}: {gap:.2f} m")
         for row, s, length, arc_length in self.reference.length_errors():
-            if abs(arc_length - length) > LENGTH_ERROR * length + 0.01:
+            if abs(arc_length - length) > min(LENGTH_ERROR * length + 0.01, LONG_ERROR):
                 report.doubt(
                     "a polynomial curve is not as long as the file says",
                     f"road {roads[row]}, s {s:.1f}: {arc_length:.2f}, {length:.2f} m",

@@ -38,6 +38,7 @@ class PlanPiece:
         kind: `CLOTHOID` (also lines and arcs) or `CURVE`.
         values: Clothoid: curvature at the start and at the end, 1/m. Curve: aU, bU, cU, dU, aV, bV, cV, dV, and the
             parameter at the end; 0 there: the parameter at which the arc length reaches `length` (poly3).
+        written_as: Element of the file, such as "arc".
     """
 
     s: float
@@ -47,6 +48,7 @@ class PlanPiece:
     length: float
     kind: int
     values: tuple[float, ...]
+    written_as: str = ""
 
 
 class Cubics:

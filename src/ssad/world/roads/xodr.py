@@ -530,7 +530,7 @@ class _Reader:
             values = (*numbers, max(end, 1e-9))
         if kind == CLOTHOID and max(map(abs, values)) * length > MAX_TURN:
             self.fail(location, f"a <geometry> turns by more than {MAX_TURN:g} rad")
-        return PlanPiece(s, x - self.shift[0], y - self.shift[1], heading, length, kind, values)
+        return PlanPiece(s, x - self.shift[0], y - self.shift[1], heading, length, kind, values, shape.tag)
 
     def cubics(self, elements: Iterable[Element], start: str, location: str) -> tuple[Cubic, ...]:
         """Return polynomials in order of their starts."""

@@ -135,7 +135,7 @@ def test_cells_are_the_clean_data_and_each_shift_and_severity() -> None:
     clean, fog = plan.cells[:2]
     assert clean.fields == {"detector": "one", "shift": None, "family": "clean", "severity": 0}
     assert fog.fields == {"detector": "one", "shift": "fog", "family": SHIFTS["fog"][0], "severity": 1}
-    assert fog.spec == {"calibration": "physical", "labels": "original", "shift": "fog"}
+    assert fog.spec == {"shift": "fog", "calibration": "physical", "labels": "original"}
     assert (fog.seed, fog.system) == (4, "one")
     assert plan.versions == {"shifts": str(VERSIONS["physical"])}
     assert plan.details == {"one": "one.pth", "two": "two.pth"}
@@ -295,7 +295,7 @@ def test_where_none_is_given_a_data_set_is_recorded(
         def __exit__(self, *error: object) -> None:
             pass
 
-    replace_name(monkeypatch, "Live", Bar)
+    replace_name(monkeypatch, "LiveProgress", Bar)
     Detection().prepare(plan_of(recorded={"scenes": 5}), tmp_path, resources)
     assert bars == [(("recording", 10, 0), "scenes")]
 

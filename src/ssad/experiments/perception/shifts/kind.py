@@ -57,7 +57,7 @@ class Detection(OpenLoopKind):
 
     def check(self, suite: DetectionSuite) -> None:
         """Raise ConfigError for a shift or severity that appears twice or does not exist."""
-        lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
+        lists: dict[str, Sequence[object]] = {"shift": list(map(label_of, suite.shifts)), "severity": suite.severities}
         for key, values in lists.items():
             if len(set(values)) != len(values):
                 raise ConfigError(f"suite {suite.name}: a {key} appears twice")
