@@ -25,6 +25,7 @@ CAMERA = Camera(
 )
 
 
+@pytest.mark.slow
 def test_roads_walks_agents_and_sky() -> None:
     """Points of roads lie on driving lanes, those of sidewalks beside them, those of agents where they stand."""
     town = load_town("ProvingGround")
@@ -71,6 +72,7 @@ def test_roads_walks_agents_and_sky() -> None:
         assert (distance < reach).mean() > 0.9, kinds[agent]
 
 
+@pytest.mark.slow
 def test_every_material_of_the_street_has_a_class() -> None:
     """What is no house, plant, ground, sign or pole is a static object; nothing is left out by a misspelt name."""
     from ssad.rendering.episode_scene import EpisodeScene
