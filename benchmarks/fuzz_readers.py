@@ -674,9 +674,13 @@ def _points(folder: Path) -> Sequence[Path]:
 
 
 def _read_points(folder: Path) -> object:
-    from ssad.datasets.point_files import read_points
+    from ssad.datasets.point_files import encode_points_like, read_point_file
 
-    return _read_each(folder, read_points)
+    def write_anew(path: Path) -> bytes:
+        point_file = read_point_file(path)
+        return encode_points_like(point_file, point_file.points)
+
+    return _read_each(folder, write_anew)
 
 
 def _read_each(folder: Path, *readers: Callable[[Path], object]) -> object:
@@ -709,10 +713,14 @@ def _images(folder: Path) -> Sequence[Path]:
 
 
 def _read_images(folder: Path) -> object:
-    from ssad.core.images import read_image
+    from ssad.core.image_files import encode_like, read_image_file
     from ssad.detectors.images import as_images
 
-    return _read_each(folder, read_image, as_images)
+    def write_anew(path: Path) -> bytes:
+        image_file = read_image_file(path)
+        return encode_like(image_file, image_file.rgb)
+
+    return _read_each(folder, write_anew, as_images)
 
 
 def _mesh(folder: Path) -> Sequence[Path]:

@@ -89,6 +89,7 @@ def test_every_format_is_read_and_written_with_its_own_channels(name: str) -> No
     assert np.abs(image_file.rgb.astype(int) - expected).max() == 0
     assert decode_image(data).tobytes() == image_file.rgb.tobytes()
     assert image_file.rgb.std() > 20
+    assert image_file.rgb.flags.writeable, "torch warns of arrays that are not"
     changed = foggy(image_file)
     result = decode_image_file(encode_like(image_file, changed, quality=98, subsampling="444"), name)
     assert (result.format, result.model, result.alpha is not None) == (kind, model, has_alpha)

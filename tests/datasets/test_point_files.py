@@ -189,6 +189,7 @@ BROKEN = {
     "format.ply": (FILES["ascii.ply"].replace(b"format ascii", b"format squeezed"), "format 'squeezed'"),
     "faces.ply": (ply("binary_little_endian", bytes(13), before=FACES), "before the vertices"),
     "none.ply": (b"ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
+    "empty.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "a point of 0 numbers"),
     "line.ply": (b"ply\nformat ascii 1.0\nhello there\nend_header\n", "a line 'hello there'"),
     "text.ply": (b"hello", "no header of a PLY file"),
     "rows.bin": (bytes(21), "no whole number of 20-byte points"),

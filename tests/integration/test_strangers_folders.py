@@ -20,6 +20,7 @@ from ssad.engine.store import Store
 from ssad.experiments.runs import write_report
 from ssad.recorders.shifted.image_folder import shift_pictures
 from ssad.report.load import load_run
+from ssad.report.tables import Table, write_tables
 from ssad.results import load_results
 
 
@@ -167,3 +168,17 @@ def test_pictures_are_not_shifted_through_a_link(tmp_path: Path, victim: Path, p
     (tmp_path / "out" / place).symlink_to(victim)
     with pytest.raises(StoreError, match=f"{place}: is a symbolic link"):
         shift_pictures(tmp_path / "data", tmp_path / "out", **options)
+
+
+def test_parts_of_a_tour_and_tables_have_no_place_outside(tmp_path: Path) -> None:
+    victim = make_run(tmp_path / "victim")
+    before = sorted(path.name for path in victim.iterdir())
+    line = {"key": "a1", "status": "ok", "reason": "", "metrics": {}, "part": "a", "n": 1}
+    header = {"kind": "tour", "suite": {"name": "s", "kind": "tour", "parts": [{"name": "../victim"}]}}
+    run = write_run(tmp_path / "run", header, [line])
+    with pytest.raises(StoreError, match="is no path below this folder"):
+        write_report(run)
+    assert sorted(path.name for path in victim.iterdir()) == before
+    table = Table("../../victim/run", "T", (), (), ())
+    with pytest.raises(StoreError, match="is no path below this folder"):
+        write_tables(tmp_path / "run", [table])

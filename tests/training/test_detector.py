@@ -8,9 +8,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.bodies import plain_bodies
 from helpers.sharing import Shared
+from PIL import Image
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.cli import main
@@ -21,7 +23,7 @@ from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import parse_target
 from ssad.training import detector as training
-from ssad.training.detector import DetectorPlan, command_of, describe_data, run_training
+from ssad.training.detector import DetectorPlan, coco_items, command_of, describe_data, run_training
 from ssad.training.recipe import find_recipe
 
 SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
@@ -219,3 +221,26 @@ def test_through_the_command(
         main()
     assert stop.value.code == 2
     assert "zoom" in capsys.readouterr().err
+
+
+def test_a_turned_picture_is_trained_on_in_the_frame_of_its_boxes(tmp_path: Path) -> None:
+    """COCO's boxes mean the stored pixels; a file whose stated size is the upright one means those."""
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[5:15, 30:50] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    (tmp_path / "images").mkdir()
+    (tmp_path / "annotations").mkdir()
+    Image.fromarray(image).save(tmp_path / "images" / "a.png", exif=exif)
+    upright_box = [40 - 15, 30, 10, 20]
+    for width, height, box in ((60, 40, [30, 5, 20, 10]), (40, 60, upright_box)):
+        row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": box, "area": 200, "iscrowd": 0}
+        images = [{"id": 1, "file_name": "a.png", "width": width, "height": height}]
+        content = {"images": images, "annotations": [row], "categories": [{"id": 1, "name": "car"}]}
+        (tmp_path / "annotations" / "train.json").write_text(json.dumps(content))
+        _, (item,) = coco_items(tmp_path, "train")
+        pixels = item.read()
+        x1, y1, x2, y2 = item.truth.box[0].int().tolist()
+        assert pixels.shape == (height, width, 3)
+        assert pixels[y1:y2, x1:x2].min() == 255
+        assert pixels.sum() == 3 * 255 * 200

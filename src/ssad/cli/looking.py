@@ -23,7 +23,7 @@ def detect(
     detector: Annotated[
         str | None,
         typer.Option(
-            help="Name, or module:object (see: ssad list detectors).  [default: yolov5n; of a folder fcos3d-light]"
+            help="Name, onnx:FILE or module:object (see: ssad list detectors).  [default: yolov5n, or fcos3d-light]"
         ),
     ] = None,
     weights: Annotated[Path | None, typer.Option(help="File of weights.  [default: the shipped ones]")] = None,

@@ -46,6 +46,13 @@ class DepthCamera:
 
 
 @dataclass(frozen=True, slots=True)
+class SemanticCamera:
+    """A camera that names what it sees: kinds of surfaces in place of colours."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One exposure of one camera, without its pixels.
 

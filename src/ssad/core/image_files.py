@@ -227,7 +227,12 @@ def _pnm_maximum(data: bytes) -> int:
 
 def _decode_16_bits(data: bytes, name: str, file_format: str) -> npt.NDArray[np.uint16]:
     """Return uint16 [H, W] or [H, W, C], RGB or RGBA."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    log_level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it reports broken files on standard error
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
     if pixels is None or pixels.dtype != np.uint16 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
         raise FormatError(f"{name}: 16 bits a channel in a layout that is not supported; save it as PNG")
     if file_format == "PPM":

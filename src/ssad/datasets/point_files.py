@@ -173,7 +173,7 @@ def _read_pcd(content: bytes, name: str) -> PointFile:
     encoding = " ".join(header["DATA"])
     body = content[offset:]
     if encoding == "ascii":
-        values = _numbers(body, name, point_count * sum(counts)).reshape(point_count, -1)
+        values = _numbers(body, name, point_count * sum(counts)).reshape(point_count, sum(counts))
         records = _records_of(values, dtype)
     elif encoding == "binary":
         records = _packed_records(body, name, point_count, dtype)
@@ -216,7 +216,7 @@ def _read_ply(content: bytes, name: str) -> PointFile:
             raise FormatError(f"{name}: {count} points are more than the limit of {MAX_BYTES} bytes")
         if element == "vertex" and encoding == "ascii":
             rows = b"\n".join(body.split(b"\n")[skipped_lines : skipped_lines + count])
-            records = _records_of(_numbers(rows, name, count * len(fields)).reshape(count, -1), dtype)
+            records = _records_of(_numbers(rows, name, count * len(fields)).reshape(count, len(fields)), dtype)
             return _from_records(records, name, "ply", is_text=True)
         if element == "vertex":
             is_last = elements[-1][0] == "vertex"
@@ -236,7 +236,7 @@ def _record_type(
     names = [field if field != "_" else f"_{index}" for index, field in enumerate(fields)]
     if len(set(names)) < len(names):
         raise FormatError(f"{name}: two fields of one name ({', '.join(fields)})")
-    if sum(counts) > 1024:
+    if not 0 < sum(counts) <= 1024:
         raise FormatError(f"{name}: a point of {sum(counts)} numbers")
     return np.dtype(
         [

@@ -108,6 +108,7 @@ class _NamedDriver:
         self.act = system.act
         self.cameras: Mapping[str, Camera] = getattr(system, "cameras", {})
         self.depth_cameras: Mapping[str, Camera] = getattr(system, "depth_cameras", {})
+        self.semantic_cameras: Mapping[str, Camera] = getattr(system, "semantic_cameras", {})
         self.lidars: Mapping[str, Lidar] = getattr(system, "lidars", {})
         self.radars: Mapping[str, Lidar] = getattr(system, "radars", {})
         if isinstance(system, Believer):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ssad.core import safeio
+from ssad.core.folders import path_inside
 from ssad.metrics import Estimate
 
 Record = TypeVar("Record")
@@ -302,7 +303,7 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     safeio.make_folder(folder / "tables")
     for table in tables:
         for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
-            path = folder / "tables" / f"{table.name}.{suffix}"
+            path = path_inside(folder / "tables", f"{table.name}.{suffix}")
             safeio.write_atomic(path, text)
             paths.append(path)
     return paths

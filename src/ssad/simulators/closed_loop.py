@@ -22,9 +22,11 @@ from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 if TYPE_CHECKING:
-    from ssad.core.frames import Camera, DepthCamera
+    from ssad.core.frames import Camera, DepthCamera, SemanticCamera
     from ssad.drivers.careful.grade import Grade
     from ssad.rendering.lidar import Lidar
+
+    RequestedSensor = Camera | DepthCamera | SemanticCamera | tuple[str, Lidar]
 
 STEP = 0.1  # s
 WIDTH = 640  # pixels of a picture of nuScenes' rig
@@ -305,21 +307,24 @@ def steps_per_trace_step(driver: Driver) -> int:
     return count
 
 
-def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | DepthCamera | tuple[str, Lidar]]:
+def requested_sensors(drivers: Sequence[Driver]) -> dict[str, RequestedSensor]:
     """Return the sensors that drivers name in `sensors`, by name.
 
     Returns:
-        Cameras, depth cameras, and pairs ("lidar" or "radar", model).
+        Cameras, depth and semantic cameras, and pairs ("lidar" or "radar", model).
     """
-    from ssad.core.frames import DepthCamera
+    from ssad.core.frames import DepthCamera, SemanticCamera
     from ssad.rendering.camera.rig import rig_camera
     from ssad.rendering.lidar import HDL32E
 
-    sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = {}
+    sensors: dict[str, RequestedSensor] = {}
     for driver in drivers:
         # A driver's own models take precedence over the sensors of nuScenes with the same name.
-        driver_sensors: dict[str, Camera | DepthCamera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors: dict[str, RequestedSensor] = dict(getattr(driver, "cameras", {}))
         driver_sensors |= {name: DepthCamera(camera) for name, camera in getattr(driver, "depth_cameras", {}).items()}
+        driver_sensors |= {
+            name: SemanticCamera(camera) for name, camera in getattr(driver, "semantic_cameras", {}).items()
+        }
         driver_sensors |= {
             name: ("lidar", sensor_model) for name, sensor_model in getattr(driver, "lidars", {}).items()
         }
@@ -341,9 +346,10 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     required = requested_sensors(drivers)
     if not required:
         return {}
-    from ssad.core.frames import DepthCamera
+    from ssad.core.frames import DepthCamera, SemanticCamera
     from ssad.rendering.onboard import Onboard
     from ssad.rendering.radar import OnboardRadar
+    from ssad.rendering.semantic import OnboardSemanticCamera
 
     onboard = Onboard(device=device)
     sensors: dict[str, Sensor] = {**onboard.rig(), LIDAR: onboard.lidar()}
@@ -354,6 +360,8 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
             )
         elif isinstance(sensor_model, DepthCamera):
             sensors[name] = onboard.depth_camera(sensor_model.camera)
+        elif isinstance(sensor_model, SemanticCamera):
+            sensors[name] = OnboardSemanticCamera(onboard, sensor_model.camera)
         else:
             sensors[name] = onboard.camera(sensor_model)
     return sensors

@@ -507,14 +507,17 @@ def test_agents_are_asked_twenty_times_a_second(tmp_path: Path) -> None:
         drive(requests, device="cpu", driver=SimpleNamespace(name="odd", period=0.03))
 
 
-def test_depth_cameras(tmp_path: Path) -> None:
+def test_depth_and_semantic_cameras(tmp_path: Path) -> None:
     """24 bits over 1000 m: the rear of a van ahead, the road below, and the sky."""
     path = tmp_path / "depth.py"
     mount = {"x": 1.0, "y": 0.0, "z": 2.0, "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
     depth = {"type": "sensor.camera.depth", "id": "depth", "width": 80, "height": 60, "fov": 90} | mount
+    labels = depth | {"type": "sensor.camera.semantic_segmentation", "id": "labels"}
     step = "def run_step(self, input_data, timestamp):\n        "
-    text = AGENT.replace("return [{", f"return {[depth]} + [{{")
-    path.write_text(text.replace(step, step + "self.seen = input_data['depth']\n        "))
+    text = AGENT.replace("return [{", f"return {[depth, labels]} + [{{")
+    path.write_text(
+        text.replace(step, step + "self.seen, self.labels = input_data['depth'], input_data['labels']\n        ")
+    )
     van = Actor("van", "van", Pose(249.0, -5.25, 0.0))
     route = (Pose(229.0, -5.25), Pose(300.0, -5.25))
     scenario = Scenario("depth", "Custom", "ProvingGround", route, actors=(van,), limits=EpisodeLimits(max_steps=1))
@@ -531,6 +534,10 @@ def test_depth_cameras(tmp_path: Path) -> None:
     # 2 m above a level road, focal length 40 pixels: row r is at 2 * 40 / (r + 0.5 - 30)
     assert metres[59, 30:50] == pytest.approx(2.0 * 40.0 / 29.5, abs=0.05)
     assert (metres[0] == 1000.0).mean() > 0.5, "sky"
+    label_image = driver.act.__self__._agents[0].labels[1]
+    assert label_image[32, 40].tolist() == [0, 0, 14, 255], "a car, in red"
+    assert (label_image[59, 30:50, 2] == 1).all(), "road"
+    assert (label_image[0, :, 2] == 11).mean() > 0.5, "sky"
 
 
 def test_depths_are_encoded_as_in_carla() -> None:
@@ -599,10 +606,10 @@ def test_it_drives_where_nothing_of_carla_is_installed(agent: Path, monkeypatch:
             monkeypatch.delitem(sys.modules, name)
     real = __import__("importlib").import_module
 
-    def without(name: str, *rest: object) -> object:
+    def without(name: str, *rest: object, **options: object) -> object:
         if name == "carla":
             raise ImportError(name)
-        return real(name, *rest)
+        return real(name, *rest, **options)
 
     monkeypatch.setattr("importlib.import_module", without)
     driver = Leaderboard(str(agent))

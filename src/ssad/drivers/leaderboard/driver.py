@@ -41,9 +41,11 @@ from ssad.drivers.leaderboard.sensors import (
     LIDAR,
     MAP,
     RADAR,
+    SEMANTIC,
     camera_of,
     carla_points,
     check_sensors,
+    encode_classes,
     encode_depth,
     fired_points,
     geolocation,
@@ -111,7 +113,12 @@ class Leaderboard:
             for specification in self._specifications
             if specification["type"] == DEPTH
         }
-        self.sensors = (*self.cameras, *self.depth_cameras, *self.lidars, *self.radars)
+        self.semantic_cameras: Mapping[str, Camera] = {
+            specification["id"]: camera_of(specification)
+            for specification in self._specifications
+            if specification["type"] == SEMANTIC
+        }
+        self.sensors = (*self.cameras, *self.depth_cameras, *self.semantic_cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
         self._episodes: list[Episode] = []
         self._scenes: list[HostedScene] = []
@@ -237,6 +244,8 @@ class Leaderboard:
                 value = np.concatenate([image[::-1], alpha]).transpose(1, 2, 0).copy()
             elif sensor_type == DEPTH:
                 value = encode_depth(view.readings[specification["id"]][row])
+            elif sensor_type == SEMANTIC:
+                value = encode_classes(view.readings[specification["id"]][row])
             elif sensor_type == LIDAR:
                 points = carla_points(view.readings[specification["id"]][row])
                 value = fired_points(points, time - self._elapsed(view, row), time)

@@ -22,12 +22,14 @@ from ssad.rendering.lidar import Lidar
 RADIUS: Final = 6378137.0  # m, of the earth in CARLA's projection
 CAMERA: Final = "sensor.camera.rgb"
 DEPTH: Final = "sensor.camera.depth"
+SEMANTIC: Final = "sensor.camera.semantic_segmentation"
 LIDAR: Final = "sensor.lidar.ray_cast"
 RADAR: Final = "sensor.other.radar"
 MAP: Final = "sensor.opendrive_map"
 LIMITS: Final[Mapping[str, int]] = {
     CAMERA: 8,
     DEPTH: 8,
+    SEMANTIC: 8,
     LIDAR: 2,
     RADAR: 4,
     "sensor.other.gnss": 1,
@@ -35,7 +37,8 @@ LIMITS: Final[Mapping[str, int]] = {
     MAP: 1,
     "sensor.speedometer": 1,
 }
-"""Kinds of sensors -> how many of one an agent may have. Depth cameras are for agents outside of the competition."""
+"""Kinds of sensors -> how many of one an agent may have. Depth and semantic cameras are for agents outside of
+the competition."""
 DEPTH_RANGE: Final = 1000.0  # m
 TURNS: Final = 10.0  # of a LiDAR in a second
 _ROUNDING: Final = 1e-4  # turns
@@ -141,6 +144,13 @@ def encode_depth(depth: F32) -> U8:
     image = np.full((*depth.shape, 4), 255, np.uint8)
     for channel, shift in ((2, 0), (1, 8), (0, 16)):
         image[..., channel] = (levels >> shift) & 255
+    return image
+
+
+def encode_classes(labels: U8) -> U8:
+    """Return CARLA's image of classes [H, W]: BGRA, the class in red [H, W, 4]."""
+    image = np.zeros((*labels.shape, 4), np.uint8)
+    image[..., 2], image[..., 3] = labels, 255
     return image
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ssad.core.errors import SSADError
+from ssad.core.folders import path_inside
 from ssad.experiments.runs import kind_of_run, write_report
 from ssad.report.default import result_table
 from ssad.report.load import Run, load_run
@@ -30,7 +31,7 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     for part_settings in run.suite["parts"]:
         name = str(part_settings["name"])
         part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_describe_part(part_settings)}
-        part_run, problem = _read_run(run.folder / name)
+        part_run, problem = _read_run(path_inside(run.folder, name))
         part["trouble"] = part["trouble"] or problem
         if part_run is not None:
             write_report(part_run.folder)

@@ -14,6 +14,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.camera.kernels import layers as layer_kernels
+from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
 from ssad.rendering.camera.kernels import sensor as sensing
 from ssad.rendering.camera.lamps import (
@@ -154,6 +155,8 @@ class Rendering:
         fragments: Pieces of textured surfaces, which are black in `image`, by pixel and triangle (see
             `ssad.rendering.camera.texture`).
         surface: Surfaces that the pixels show; None unless requested.
+        material: Row of each pixel's material in `RenderScene.material_names` [B, H, W]; -1: sky. None unless
+            requested.
     """
 
     image: U8
@@ -163,6 +166,7 @@ class Rendering:
     exposure: F64
     fragments: Any
     surface: SurfaceMap | None = None
+    material: I32 | None = None
 
 
 @lru_cache(maxsize=256)
@@ -308,6 +312,7 @@ def render(
     download: bool = True,
     linear: bool = True,
     surface: bool = False,
+    materials: bool = False,
 ) -> Rendering:
     """Render views of one size.
 
@@ -320,6 +325,7 @@ def render(
             arrays.
         linear: Whether to download the radiance too.
         surface: Whether to say what each pixel shows.
+        materials: Whether to name the material that each pixel shows.
 
     Raises:
         ConfigError: The views do not fit.
@@ -403,7 +409,13 @@ def render(
     if download:
         arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
     exported = _surface(output, np.array(lens), poses) if surface else None
-    return Rendering(*arrays, np.array(exposures), fragments, exported)
+    material = None
+    if materials:
+        found_materials = wp.empty(shape, dtype=int, device=device)
+        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
+        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
+        material = found_materials.numpy()
+    return Rendering(*arrays, np.array(exposures), fragments, exported, material)
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")

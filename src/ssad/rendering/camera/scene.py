@@ -269,6 +269,7 @@ class RenderScene:
         ]
         self.wearable = to_device(np.concatenate(has_panel).astype(np.int32), wp.int32)
         self.meshes = tuple(meshes)
+        self.material_names = tuple(entry.name for part in parts for entry in part.materials)
         self._cache: dict[Any, Any] = {}
         surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = to_device(surface_rows, matter.Surface)

@@ -62,6 +62,7 @@ _PARAMETERS: dict[int, tuple[str, ...]] = {
 }
 """What the numbers of an entry mean in SafeBench's lists `human` and `random`, by scenario id."""
 _NEAR = 2.0  # m between a trigger and the route
+_FAR = 1e9  # m; the square of a longer way may be beyond a float
 _ALIGNED = math.radians(10.0)
 _SIDES = ("front", "left", "right")  # the order in which the leaderboard reads other actors
 
@@ -332,7 +333,7 @@ def _position_along(route: _ImportedRoute, trigger: Pose) -> float | None:
     for index, (start, end) in enumerate(pairwise(route.points)):
         dx, dy = end.x - start.x, end.y - start.y
         length = math.hypot(dx, dy)
-        if length > 1e-6:
+        if 1e-6 < length < _FAR:
             t = ((trigger.x - start.x) * dx + (trigger.y - start.y) * dy) / length**2
             t = min(max(t, 0.0), 1.0)
             is_near = math.hypot(start.x + t * dx - trigger.x, start.y + t * dy - trigger.y) <= _NEAR

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Camera, DepthCamera
+from ssad.core.frames import Camera, DepthCamera, SemanticCamera
 from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.lidar import Lidar
 
@@ -237,19 +237,21 @@ def _enqueue_into(queue: Queue[tuple[int, bytes]]) -> Callable[[carla.Image | ca
 
 
 def sensor_blueprints(
-    sensors: Mapping[str, Camera | DepthCamera | tuple[str, Lidar]], dt: float
+    sensors: Mapping[str, Camera | DepthCamera | SemanticCamera | tuple[str, Lidar]], dt: float
 ) -> dict[str, SensorBlueprint]:
     """Return CARLA's sensors by name, for cameras, and for LiDARs and radars paired with "lidar" or "radar".
 
     Raises:
-        ConfigError: A depth camera is asked for, of which SSAD reads none from CARLA.
+        ConfigError: A depth or semantic camera is asked for; SSAD reads none from CARLA.
     """
     blueprints = {}
     for name, sensor in sensors.items():
         if isinstance(sensor, Camera):
             blueprints[name] = camera_blueprint(sensor)
-        elif isinstance(sensor, DepthCamera):
-            raise ConfigError(f"sensor '{name}': a depth camera is not read from CARLA; leave sensors=carla out")
+        elif isinstance(sensor, DepthCamera | SemanticCamera):
+            raise ConfigError(
+                f"sensor '{name}': depth and semantic cameras are not read from CARLA; leave sensors=carla out"
+            )
         else:
             blueprints[name] = (
                 lidar_blueprint(sensor[1], dt) if sensor[0] == "lidar" else radar_blueprint(sensor[1], dt)
