@@ -112,7 +112,7 @@ CASES = (
     ("detect empty out", "no nuScenes folder"),
     ("import map map.xodr", "road 1: <road> has no attribute 'length'"),
     ("import map entity.xodr", "refused: it declares a DTD"),
-    ("import routes routes", "no JSON file with available_scenarios"),
+    ("import routes routes", "no <route> in it"),
     ("export RightTurn/00 out --format wizard", "'--format': 'wizard' is not one of"),
     ("export RightTurn/00 out", "Missing option '--format'. Choose from: openscenario, leaderboard"),
     ("import openscenario scene.xosc out.yaml", "scene.xosc"),

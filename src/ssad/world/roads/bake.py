@@ -64,7 +64,6 @@ def bake(
     path = Path(xodr)
     account = ImportReport(str(path)) if report is None else report
     stage = progress or (lambda text: None)
-    stage("reading the file")
     network = read_network(path, account)
     keys = [
         (road.id, index, lane)
