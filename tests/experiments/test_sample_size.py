@@ -103,8 +103,8 @@ def test_the_largest_suite_detects_what_it_says(work: Path) -> None:
     [
         (("tour", "--detect", "0.1"), ("kind 'tour'", "driving, adversarial, gap")),
         (("gap-quick", "--detect", "0.1"), ("no flip rates of kind 'gap'", "--runs FOLDER")),
-        ((*RIGHT_TURN, "--runs", "x"), ("--runs can only be used with --detect",)),
-        ((*RIGHT_TURN, "--detect", "0.1", "--runs", "nowhere"), ("nowhere: no run here",)),
+        ((*RIGHT_TURN, "--runs", "."), ("--runs can only be used with --detect",)),
+        ((*RIGHT_TURN, "--detect", "0.1", "--runs", "nowhere"), ("nowhere: no such file or folder",)),
         ((*RIGHT_TURN, "--detect", "0.1", "--runs", "gap"), ("a run of kind 'gap' says nothing about kind 'driving'",)),
         ((*RIGHT_TURN, "--detect", "0.1", "--runs", "alone"), ("no two systems or perturbations met the same cases",)),
         (("quik", "--detect", "0.1"), ("unknown suite 'quik'",)),

@@ -268,7 +268,7 @@ ALTERATIONS: dict[str, tuple[Alter, str]] = {
     ),
     "a number too large for a float": (
         replace_text(RESULTS, 3, r'"time":[0-9.]+', '"time":1e999'),
-        f"{RESULTS}:3: metrics.time is Infinity, which is no plausible number{REMEDY}",
+        f"{RESULTS}:3: metrics.time is Infinity, which is no number{REMEDY}",
     ),
     "text in place of a number": (
         set_metric(RESULTS, 2, "time", "long"),

@@ -84,6 +84,7 @@ def two_lanes(ends: float = 400.0) -> LaneGraph:
         road=i32(0, 0, 1)[:count],
         section=i32(0, 0, 0)[:count],
         lane_id=i32(-2, -1, -1)[:count],
+        forward=np.zeros(0, bool),  # made anew from the lanes
         junction=i32(-1, -1, -1)[:count],
         speed_limit=np.full(count, 30.0, np.float32),
         left=i32(1, -1, -1)[:count],
