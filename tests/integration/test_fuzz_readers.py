@@ -57,6 +57,7 @@ def test_equal_seeds_give_equal_mutations() -> None:
         (parse_yaml, "seed: 1e999", "<text>:1: 1e999 is too large for a number"),
         (parse_json, "9" * 400, "a number of 400 digits"),
         (parse_json, "[1e999]", "1e999 is too large for a number"),
+        (parse_json, '{"a": "\\ud800"}', "surrogates not allowed"),
         (parse_json, "[" * 200_000 + "]" * 200_000, "nested deeper than 100 levels"),
         (parse_json, '{"a":' * 101 + "1" + "}" * 101, "nested deeper than 100 levels"),
     ],
@@ -68,5 +69,6 @@ def test_numbers_and_depths_beyond_reason_are_one_line(read: object, text: str, 
 
 
 def test_long_numbers_and_brackets_in_texts_are_read() -> None:
+    assert parse_json('"\\ud83d\\ude97"') == "\U0001f697"
     assert parse_json("[" * 100 + "]" * 100) is not None
     assert parse_json(f'["{"[" * 500}\\"{"[" * 500}", "{"9" * 400}", 1e-400, 1e300, {10**200}]')[3:] == [1e300, 10**200]
