@@ -5,7 +5,8 @@
     uv run python benchmarks/fuzz_readers.py --reader suite --index 17    # one mutation again, with its traceback
 
 A reader may return, or raise an SSADError of one line. Every other error counts, and so does a read that takes more
-than 10 s of the processor or 2 GiB. A mutation depends only on the seed, the name of the reader and its index, so each can be repeated.
+than 10 s of the processor or 2 GiB. A mutation depends only on the seed, the name of the reader and its index, so each
+can be repeated.
 Bytes are mutated (bits, cuts, insertions, repetitions), and so are the tokens of texts, the values of JSON and YAML,
 elements and attributes of XML, arrays of npz files, headers of safetensors and members of zip files.
 """
