@@ -5,7 +5,8 @@
     uv run python benchmarks/fuzz_readers.py --reader suite --index 17    # one mutation again, with its traceback
 
 A reader may return, or raise an SSADError of one line. Every other error counts, and so does a read that takes more
-than 10 s or 2 GiB. A mutation depends only on the seed, the name of the reader and its index, so each can be repeated.
+than 10 s of the processor or 2 GiB. A mutation depends only on the seed, the name of the reader and its index, so each
+can be repeated.
 Bytes are mutated (bits, cuts, insertions, repetitions), and so are the tokens of texts, the values of JSON and YAML,
 elements and attributes of XML, arrays of npz files, headers of safetensors and members of zip files.
 """
@@ -815,21 +816,21 @@ def check_line(error: SSADError) -> str:
 
 @contextlib.contextmanager
 def bounded(seconds: float = SECONDS, memory_bytes: int = MEMORY_BYTES) -> Iterator[None]:
-    """Limit the time and the additional memory of a block: TooLong or MemoryError."""
+    """Limit the processor time and the additional memory of a block: TooLong or MemoryError."""
 
     def stop(*_: object) -> None:
-        raise TooLong(f"takes longer than {seconds:g} s")
+        raise TooLong(f"takes longer than {seconds:g} s of the processor")
 
     page_count = int(Path("/proc/self/statm").read_text().split()[0])
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    handler = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     resource.setrlimit(resource.RLIMIT_AS, (page_count * resource.getpagesize() + memory_bytes, limits[1]))
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, handler)
         resource.setrlimit(resource.RLIMIT_AS, limits)
 
 

@@ -288,7 +288,7 @@ def test_mistakes_are_one_line(foreign: Path, tmp_path: Path, ssad_home: Path) -
     for words, message in (
         ((foreign, "--scene", "scene-0", out), "no scene 'scene-0'; closest: scene-twinford-000"),
         ((foreign, "--scene", SCENE, "--version", "v1.0-mini", out), "no version 'v1.0-mini' (found: v1.0-ssad)"),
-        ((tmp_path / "none", "--scene", SCENE, out), "no such folder"),
+        ((tmp_path / "none", "--scene", SCENE, out), "no such file or folder"),
         ((empty, "--scene", "scene-1", out), "nothing is annotated that could be an actor; choose another scene"),
         ((stands, "--scene", "scene-1", out), "the ego drives less than 10 m; choose another scene"),
         ((foreign, "--scene", SCENE, tmp_path / "x.json"), "a scenario file ends in .yaml"),

@@ -287,6 +287,7 @@ def _refuse_constant(text: str) -> float:
 
 
 _LONG_NUMBER = re.compile(r"[0-9]{300}|[eE]\+?[0-9]{3}")
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _JSON_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _BRACKETS = np.zeros(256, np.int8)
 _BRACKETS[list(b"[{")], _BRACKETS[list(b"]}")] = 1, -1
@@ -336,9 +337,13 @@ def parse_json(text: str | bytes, name: str = "<text>") -> Any:
         if _json_depth(text) > MAX_JSON_DEPTH:
             raise FormatError(f"{name}: nested deeper than {MAX_JSON_DEPTH} levels")
         hooks: dict[str, Any] = {}
-        if _LONG_NUMBER.search(text if isinstance(text, str) else text.decode(json.detect_encoding(text))):
+        decoded_text = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
+        if _LONG_NUMBER.search(decoded_text):
             hooks = {"parse_int": _parse_finite_int, "parse_float": _parse_finite_float}  # slower than json's own
-        return json.loads(text, object_pairs_hook=_refuse_duplicate_keys, parse_constant=_refuse_constant, **hooks)
+        data = json.loads(text, object_pairs_hook=_refuse_duplicate_keys, parse_constant=_refuse_constant, **hooks)
+        if _SURROGATE.search(decoded_text):
+            json.dumps(data, ensure_ascii=False).encode()  # half a character cannot be written again
+        return data
     except json.JSONDecodeError as error:
         raise FormatError(f"{name}:{error.lineno}: not valid JSON: {error.msg}") from None
     except (ValueError, RecursionError) as error:

@@ -34,6 +34,7 @@ STEP: Final = 0.1  # s of the world
 KEY_POINT: Final = 25.0  # m between key points of the ego's route
 OFF: Final = 5.0  # m, largest distance of the logged ego from its route: it may be changing lanes
 LEAST_WAY: Final = 10.0  # m, minimum drive of the ego
+MAX_WAY: Final = 1e5  # m that the ego drives
 MOVED: Final = 10.0  # m, minimum drive of a vehicle whose path counts as a lane
 CARS: Final = ("car", "suv", "coupe", "compact", "van")
 LARGE: Final = ("truck", "bus", "van")
@@ -108,7 +109,10 @@ def scenario_of_drive(
     if len(ego_poses) < 2:
         raise ConfigError(f"{location}: it has no poses of the ego")
     path_length = ego_poses[ego_poses[:, 0] >= -0.25]
-    if float(np.hypot(*np.diff(path_length[:, 1:3], axis=0).T).sum()) < LEAST_WAY:
+    way = float(np.hypot(*np.diff(path_length[:, 1:3], axis=0).T).sum())
+    if not way <= MAX_WAY:
+        raise ConfigError(f"{location}: the ego drives {way / 1000:.3g} km; at most {MAX_WAY / 1000:g} km are imported")
+    if way < LEAST_WAY:
         raise ConfigError(f"{location}: the ego drives less than {LEAST_WAY:g} m; choose another scene")
     tracks, left_out = _tracks(scene_data, start)
     if not tracks:

@@ -14,6 +14,7 @@ from ssad.core.types import F64, Bool, LaneType
 
 WIDTH: Final = 3.5  # m
 STEP: Final = 1.0  # m between points of a lane
+MAX_LENGTH: Final = 1e5  # m of a path
 APART: Final = 0.25  # m that a path must move on to count as another point
 LEAST: Final = 10.0  # m, the shortest lane
 BEFORE, AFTER = 5.0, 30.0  # m that the first path goes on straight at its ends
@@ -34,7 +35,7 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
         width: Of the lanes, m.
 
     Raises:
-        MapError: The first path is shorter than 10 m.
+        MapError: The first path is shorter than 10 m, or a path is longer than 100 km.
     """
     lanes: list[F64] = []
     limits: list[float] = []
@@ -93,6 +94,10 @@ def _resample(path: F64) -> F64:
             direction = move / distance
     xy = np.array(points, np.float64)
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]) if len(xy) > 1 else np.zeros(1)
+    if not arc_length[-1] <= MAX_LENGTH:
+        raise MapError(
+            f"a driven path is {arc_length[-1] / 1000:.3g} km long; at most {MAX_LENGTH / 1000:g} km become a lane"
+        )
     positions = np.arange(0.0, arc_length[-1] + 1e-9, STEP)
     return np.stack([np.interp(positions, arc_length, xy[:, 0]), np.interp(positions, arc_length, xy[:, 1])], 1)
 
