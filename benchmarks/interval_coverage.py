@@ -410,10 +410,10 @@ def limits_of_likelihood(sums: F64, layout: Clusters, _: float) -> tuple[F64, F6
 
 def limits_if_known(sums: F64, layout: Clusters, design_effect: float) -> tuple[F64, F64]:
     """Limits that know the design effect, unless no case is an event: then as many cases as clusters."""
-    known = known_effect_limits(sums, layout, design_effect)
-    nothing = share_limits(known.mean, np.full(known.mean.shape, 1.0 / float((layout.weight**2).sum())))
+    oracle = known_effect_limits(sums, layout, design_effect)
+    nothing = share_limits(oracle.mean, np.full(oracle.mean.shape, 1.0 / float((layout.weight**2).sum())))
     has_events = sums.any(axis=1)
-    return np.where(has_events, known.low, nothing[0]), np.where(has_events, known.high, nothing[1])
+    return np.where(has_events, oracle.low, nothing[0]), np.where(has_events, oracle.high, nothing[1])
 
 
 ALTERNATIVES: dict[str, Limits] = {
@@ -439,13 +439,13 @@ def alternative_lines(draws: int) -> list[str]:
             for share in shares:
                 random = stream("alternatives", routes, design_effect, share)
                 (sums,) = counts(random, draws, (share,), layout, correlation_of(design_effect, layout))
-                known = known_effect_limits(sums, layout, design_effect)
+                oracle = known_effect_limits(sums, layout, design_effect)
                 for name, limits in ALTERNATIVES.items():
                     low, high = limits(sums, layout, design_effect)
                     target = held_alike if design_effect == greatest else held
                     target[name].append(coverage(share, low, high)[0])
                     if design_effect < greatest and share in ROUTE_SHARES:
-                        ratio = float((high - low).mean() / (known.high - known.low).mean())
+                        ratio = float((high - low).mean() / (oracle.high - oracle.low).mean())
                         widths.setdefault((name, routes), []).append(ratio)
     lines = [
         f"Other intervals of a share on the same routes ({draws:,} data sets a cell, shares from {shares[0]:g} to "

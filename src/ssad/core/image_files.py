@@ -95,7 +95,7 @@ class ImageFile:
 
     @property
     def has_16_bits(self) -> bool:
-        """Whether a channel has 16 bits."""
+        """True if a channel has 16 bits."""
         return self.pixels.dtype == np.uint16
 
     @property

@@ -1,4 +1,4 @@
-"""What an import took over, left out, and doubted."""
+"""Report of an import: what it took over, left out, and doubted."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ class Waypoint:
 
     @property
     def is_junction(self) -> bool:
-        """Whether the lane crosses a junction."""
+        """True if the lane crosses a junction."""
         return self.junction_id >= 0
 
     @property
