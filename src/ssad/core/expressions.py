@@ -1,62 +1,40 @@
-"""Arithmetic expressions of scenario files: `2 * speed + 5`, or `${2 * $speed + 5}` as in OpenSCENARIO.
+"""Expressions over named values: the grammar of OpenSCENARIO XML 1.1 and later, with its extensions in use.
 
-Grammar, from loose to tight: `or`, `and`, `not`, comparisons (== != < <= > >=), + and -, * / and %, a sign; then
-numbers, names (`speed` or `$speed`), `true`, `false`, `pi`, calls and parentheses. Functions: abs, ceil, floor, max,
-min, pow, round, sign, sqrt. Comparisons and logic give 1 or 0. Nothing else can be written, so that an expression of a
-file by others is safe to evaluate.
+SSAD's scenario files use the same grammar, in which names also stand alone: `2 * speed + 5` is `${2 * $speed + 5}`.
 
-Source: ASAM OpenSCENARIO XML 1.3, section "Expressions". `%` has the sign of the dividend, and `round` moves halves
-away from zero, as in C.
+    expression := or ; or := and ("or" and)* ; and := comparison ("and" comparison)*
+    comparison := sum (("<" | "<=" | ">" | ">=" | "==" | "!=") sum)?
+    sum := product (("+" | "-") product)* ; product := unary (("*" | "/" | "%") unary)*
+    unary := ("-" | "+" | "not") unary | number | "true" | "false" | constant | "$" name | function "(" ... ")"
+             | "(" expression ")"
+
+Numbers are real: 3 / 2 is 1.5. The remainder has the sign of the dividend, as in C. Comparisons, trigonometric
+functions (rad) and pi are extensions that esmini and others read too.
+
+Source: ASAM OpenSCENARIO XML 1.3, section on parameters, expressions.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
-import operator
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Final, TypeAlias
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import Final
 
 from ssad.core.errors import ConfigError
 
-MAX_LENGTH: Final = 1000
-MAX_DEPTH: Final = 50
-NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-"""Names that parameters may have."""
+Value = float | int | bool | str
+Lookup = Callable[[str], Value]
 
-_TOKEN: Final = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>\$?[A-Za-z_][A-Za-z0-9_]*)"
-    r"|(?P<sign>==|!=|<=|>=|[-+*/%()<>,]))"
+MAX_LENGTH: Final = 4_000
+MAX_DEPTH: Final = 100
+MAX_WHOLE: Final = 2**53
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|\$\{?\s*(?P<name>[^\W\d][\w.]*)\}?|(?P<word>[A-Za-z_]\w*)"
+    r"|(?P<sign><=|>=|==|!=|[-+*/%(),<>]))"
 )
-_COMPARISONS: Final[dict[str, Callable[[float, float], bool]]] = {
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
-_CONSTANTS: Final = {"true": 1.0, "false": 0.0, "pi": math.pi}
-RESERVED: Final = ("and", "or", "not", "true", "false")
-"""Words of the grammar that no parameter may have as its name."""
-
-
-def _remainder(left: float, right: float) -> float:
-    if right == 0.0:
-        raise ZeroDivisionError
-    return math.fmod(left, right)
-
-
-_OPERATIONS: Final[dict[str, Callable[[float, float], float]]] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-    "%": _remainder,
-}
+_CONSTANTS: Final[Mapping[str, Value]] = {"true": True, "false": False, "pi": math.pi}
 
 
 def _round(value: float) -> float:
@@ -64,116 +42,97 @@ def _round(value: float) -> float:
 
 
 def _sign(value: float) -> float:
-    return float((value > 0.0) - (value < 0.0))
+    return 0.0 if value == 0.0 else math.copysign(1.0, value)
 
 
-FUNCTIONS: Final[dict[str, tuple[Callable[..., float], int, int]]] = {
-    "abs": (abs, 1, 1),
-    "ceil": (lambda value: float(math.ceil(value)), 1, 1),
-    "floor": (lambda value: float(math.floor(value)), 1, 1),
-    "max": (max, 2, 100),
-    "min": (min, 2, 100),
-    "pow": (math.pow, 2, 2),
-    "round": (_round, 1, 1),
-    "sign": (_sign, 1, 1),
-    "sqrt": (math.sqrt, 1, 1),
+_FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., float]]]] = {
+    "pow": (2, math.pow),
+    "sqrt": (1, math.sqrt),
+    "sign": (1, _sign),
+    "round": (1, _round),
+    "floor": (1, math.floor),
+    "ceil": (1, math.ceil),
+    "abs": (1, abs),
+    "max": (2, max),
+    "min": (2, min),
+    "sin": (1, math.sin),
+    "cos": (1, math.cos),
+    "tan": (1, math.tan),
+    "asin": (1, math.asin),
+    "acos": (1, math.acos),
+    "atan": (1, math.atan),
+    "atan2": (2, math.atan2),
+    "exp": (1, math.exp),
+    "log": (1, math.log),
 }
-"""Function name -> function, fewest and most arguments."""
-
-_Node: TypeAlias = "Callable[[Mapping[str, float]], float]"
-
-
-class _SyntaxError(Exception):
-    """Problem of the text of an expression, in words."""
-
-
-@dataclass(frozen=True)
-class Expression:
-    """A parsed expression.
-
-    Attributes:
-        text: The text as written.
-        names: Names that it uses, in the order of their first use, without `$`.
-        is_condition: Whether its value is a truth value: that of a comparison, of logic, or `true` and `false`.
-    """
-
-    text: str
-    names: tuple[str, ...]
-    is_condition: bool
-    _node: _Node
-
-    def value(self, values: Mapping[str, float]) -> float:
-        """Return the value of the expression.
-
-        Args:
-            values: Name -> number of all names that it may use.
-
-        Returns:
-            A finite number; 1 or 0 for a condition.
-
-        Raises:
-            ConfigError: A name is unknown, a division by zero, or a result that is no finite number.
-        """
-        for name in self.names:
-            if name not in values and name not in _CONSTANTS:
-                raise ConfigError(f"'{self.text}': unknown name '{name}'; {_suggestion(name, values)}")
-        try:
-            value = float(self._node(values))
-        except ZeroDivisionError:
-            raise ConfigError(f"'{self.text}': division by zero{_numbers(self.names, values)}") from None
-        except (ValueError, OverflowError):
-            value = math.nan
-        if not math.isfinite(value):
-            raise ConfigError(f"'{self.text}': the result is not a finite number{_numbers(self.names, values)}")
-        return value
+RESERVED: Final = frozenset({"and", "or", "not", "true", "false", "pi"})
+"""Words that no parameter can have as its name."""
+_COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+}
 
 
-def _suggestion(name: str, values: Mapping[str, float]) -> str:
-    if not values:
-        return "no parameters are declared"
-    matches = difflib.get_close_matches(name, sorted(values), n=3, cutoff=0.0)
-    return f"closest: {', '.join(matches)}"
-
-
-def _numbers(used_names: Sequence[str], values: Mapping[str, float]) -> str:
-    """Return the values behind an error, in words; empty: the expression uses no names."""
-    listed = ", ".join(f"{name} = {values[name]:g}" for name in used_names if name in values)
-    return f" where {listed}" if listed else ""
-
-
-@lru_cache(maxsize=4096)
-def parse_expression(text: str) -> Expression:
-    """Parse an expression.
+def evaluate(expression: str, values: Mapping[str, Value] | Lookup, *, bare_names: bool = False) -> Value:
+    """Evaluate an expression.
 
     Args:
-        text: The expression, with or without `${` and `}` around it.
+        expression: The text, without the `${` and `}` around it.
+        values: Value of each name, or a function that returns it and raises KeyError for an unknown name. A text that
+            is a number or a truth value counts as one.
+        bare_names: Whether a name may stand without `$`.
 
     Returns:
-        The expression.
+        The value: a number, a truth value, or a text if the expression is a single name of a text.
 
     Raises:
-        ConfigError: It is not one; the message quotes the text and says where it goes wrong.
+        ConfigError: It is no expression, has an unknown name, or has no finite value; the message quotes it.
     """
-    if len(text) > MAX_LENGTH:
-        raise ConfigError(f"'{text[:40]}...': an expression has at most {MAX_LENGTH} characters, not {len(text)}")
-    body = text.strip()
-    if body.startswith("${") and body.endswith("}"):
-        body = body[2:-1]
+    if len(expression) > MAX_LENGTH:
+        raise ConfigError(f"an expression of {len(expression)} characters; at most {MAX_LENGTH} are read")
+    parser = _Parser(expression, values if callable(values) else values.__getitem__, bare_names)
     try:
-        parser = _Parser(body)
-        node, is_condition = parser.parse()
-    except _SyntaxError as error:
-        raise ConfigError(f"'{text}' is not an expression: {error}") from None
-    return Expression(text, tuple(dict.fromkeys(parser.names)), is_condition, node)
+        value = parser.parse()
+    except ZeroDivisionError:
+        raise parser.error("division by zero") from None
+    except (ValueError, OverflowError):
+        raise parser.error("it has no real value") from None
+    except RecursionError:
+        raise parser.error("too many nested brackets") from None
+    if isinstance(value, float) and not math.isfinite(value):
+        raise parser.error("its value is not finite")
+    return value
 
 
-def evaluate(text: str, values: Mapping[str, float]) -> float:
-    """Return the value of the text of an expression; see `parse_expression` and `Expression.value`."""
-    return parse_expression(text).value(values)
+def number_or_text(text: str) -> Value:
+    """Return the number or truth value that a text states, else the text."""
+    stripped = text.strip()
+    if stripped in ("true", "false"):
+        return stripped == "true"
+    try:
+        return int(stripped)
+    except ValueError:
+        pass
+    try:
+        value = float(stripped)
+    except ValueError:
+        return text
+    return value if math.isfinite(value) else text
+
+
+def text_of(value: Value) -> str:
+    """Return a value as OpenSCENARIO writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+    return str(value)
 
 
 class ParameterError(ConfigError):
-    """Error in the expression of a parameter.
+    """Error of the expression of a parameter.
 
     Attributes:
         name: The parameter.
@@ -188,189 +147,237 @@ def resolve_values(entries: Mapping[str, float | str], known_values: Mapping[str
     """Return the values of parameters that may depend on one another, in any order.
 
     Args:
-        entries: Parameter name -> number or expression of other parameters.
-        known_values: Further names that the expressions may use.
+        entries: Parameter name -> number, or expression (see `number_of`) of other parameters.
+        known_values: Values of further names, for those that are not among the entries.
 
     Returns:
-        Parameter name -> number, in the order of `entries`.
+        Parameter name -> number, in the order of the entries.
 
     Raises:
         ParameterError: An expression is wrong, or a parameter depends on itself.
     """
-    values = dict(known_values) | {name: float(entry) for name, entry in entries.items() if not isinstance(entry, str)}
-    # Names of parameters that are not evaluated yet must not reach the known values of the same name.
-    for name, entry in entries.items():
-        if isinstance(entry, str):
-            values.pop(name, None)
+    values: dict[str, float] = {}
     chain: list[str] = []
 
-    def resolve(name: str) -> None:
-        entry = entries.get(name)
-        if name in values or not isinstance(entry, str):
-            return
+    def resolve(name: str) -> float:
+        if name not in entries:
+            return known_values[name]
         if name in chain:
-            circle = [*chain[chain.index(name) :], name]
-            raise ParameterError(f"parameters depend on one another in a circle: {' -> '.join(circle)}", name)
-        chain.append(name)
-        try:
-            expression = parse_expression(entry)
-            for used_name in expression.names:
-                resolve(used_name)
-            values[name] = expression.value(values)
-        except ParameterError:
-            raise
-        except ConfigError as error:
-            raise ParameterError(str(error), name) from None
-        finally:
+            circle = " -> ".join([*chain[chain.index(name) :], name])
+            raise ParameterError(f"parameters depend on one another in a circle: {circle}", name)
+        if name not in values:
+            chain.append(name)
+            entry = entries[name]
+            try:
+                names = {*entries, *known_values}
+                values[name] = number_of(entry, resolve, names) if isinstance(entry, str) else float(entry)
+            except ParameterError:
+                raise
+            except ConfigError as error:
+                raise ParameterError(str(error), name) from None
             chain.pop()
+        return values[name]
 
     for name in entries:
         resolve(name)
     return {name: values[name] for name in entries}
 
 
+def number_of(text: str, values: Mapping[str, float] | Lookup, names: Iterable[str] = ()) -> float:
+    """Return the number that an expression of a scenario file states.
+
+    Args:
+        text: The expression, with or without `${` and `}` around it; names may stand without `$`.
+        values: Value of each name, as for `evaluate`.
+        names: Names that are suggested for an unknown one; empty: those of a mapping of values.
+
+    Raises:
+        ConfigError: As for `evaluate`, or the value is no number. The message has the values of its names.
+    """
+    body = text.strip()
+    if body.startswith("${") and body.endswith("}") and "}" not in body[2:-1]:
+        body = body[2:-1]
+    lookup = values if callable(values) else values.__getitem__
+    used_values: dict[str, Value] = {}
+
+    def recording_lookup(name: str) -> Value:
+        try:
+            used_values[name] = lookup(name)
+        except KeyError:
+            known_names = sorted({*names} or (set() if callable(values) else {*values}))
+            suggestions = ", ".join(get_close_matches(name, known_names, n=3, cutoff=0.0))
+            hint = f"; closest: {suggestions}" if suggestions else ", and none is declared"
+            raise ConfigError(f"expression '{text.strip()[:80]}': there is no parameter '{name}'{hint}") from None
+        return used_values[name]
+
+    try:
+        value = evaluate(body, recording_lookup, bare_names=True)
+    except ParameterError:
+        raise
+    except ConfigError as error:
+        listed = ", ".join(f"{name} = {text_of(value)}" for name, value in used_values.items())
+        raise ConfigError(f"{error}{f', where {listed}' if listed else ''}") from None
+    if isinstance(value, str):
+        raise ConfigError(f"expression '{text.strip()[:80]}': '{value[:40]}' is not a number")
+    return float(value)
+
+
 class _Parser:
-    """Recursive descent through the grammar; each rule returns a function of the values, and if it is a condition."""
+    """Recursive descent over the tokens of one expression, which evaluates as it goes."""
 
-    def __init__(self, text: str) -> None:
-        self.tokens = list(_tokens(text))
-        self.position = 0
-        self.depth = 0
-        self.names: list[str] = []
+    def __init__(self, expression: str, lookup: Lookup, bare_names: bool) -> None:
+        self.expression, self.lookup, self.bare_names = expression, lookup, bare_names
+        self.tokens: list[tuple[str, str]] = []
+        self.index = self.depth = 0
+        position = 0
+        text = expression.rstrip()
+        while position < len(text):
+            match = _TOKEN.match(text, position)
+            if match is None or match.lastgroup is None:
+                raise self.error(f"'{text[position:].strip()[:20]}' is not understood")
+            self.tokens.append((match.lastgroup, match[match.lastgroup]))
+            position = match.end()
 
-    def parse(self) -> tuple[_Node, bool]:
-        rule = self.disjunction()
-        if self.position < len(self.tokens):
-            raise _SyntaxError(f"unexpected '{self.tokens[self.position]}'")
-        return rule
+    def error(self, problem: str) -> ConfigError:
+        """Return an error that quotes the expression."""
+        return ConfigError(f"expression '{self.expression.strip()[:80]}': {problem}")
 
-    def next_is(self, *tokens: str) -> str | None:
-        """Consume and return the next token if it is one of these."""
-        if self.position < len(self.tokens) and self.tokens[self.position] in tokens:
-            self.position += 1
-            return self.tokens[self.position - 1]
+    def parse(self) -> Value:
+        """Return the value of all tokens."""
+        value = self.disjunction()
+        if self.index < len(self.tokens):
+            raise self.error(f"'{self.tokens[self.index][1]}' is not expected there")
+        return value
+
+    def take(self, *texts: str) -> str | None:
+        """Consume and return the next token if it is one of these signs or words."""
+        if self.index < len(self.tokens):
+            group, text = self.tokens[self.index]
+            if group in ("sign", "word") and text in texts:
+                self.index += 1
+                return text
         return None
 
-    def disjunction(self) -> tuple[_Node, bool]:
+    def number(self, value: Value) -> float:
+        """Return a value as an operand. ConfigError if it is a text or a truth value."""
+        if isinstance(value, (str, bool)):
+            raise self.error(f"'{text_of(value)[:40]}' is not a number")
+        # Large whole numbers become floats: products of them would otherwise grow without limit.
+        return float(value) if abs(value) > MAX_WHOLE else value
+
+    def truth(self, value: Value) -> bool:
+        """Return a value as a truth value. ConfigError if it is none."""
+        if not isinstance(value, bool):
+            raise self.error(f"'{text_of(value)[:40]}' is neither true nor false")
+        return value
+
+    def disjunction(self) -> Value:
+        """Return the value of conjunctions that `or` joins."""
+        value = self.conjunction()
+        while self.take("or"):
+            other = self.truth(self.conjunction())
+            value = self.truth(value) or other
+        return value
+
+    def conjunction(self) -> Value:
+        """Return the value of comparisons that `and` joins."""
+        value = self.comparison()
+        while self.take("and"):
+            other = self.truth(self.comparison())
+            value = self.truth(value) and other
+        return value
+
+    def comparison(self) -> Value:
+        """Return the value of a sum, or of a comparison of two."""
+        value = self.sum()
+        operator = self.take("<", "<=", ">", ">=", "==", "!=")
+        if operator is None:
+            return value
+        other = self.sum()
+        if operator in _COMPARISONS:
+            return _COMPARISONS[operator](self.number(value), self.number(other))
+        return (value == other) == (operator == "==")
+
+    def sum(self) -> Value:
+        """Return the value of products that + and - join."""
+        value = self.product()
+        while operator := self.take("+", "-"):
+            left, right = self.number(value), self.number(self.product())
+            value = left + right if operator == "+" else left - right
+        return value
+
+    def product(self) -> Value:
+        """Return the value of factors that *, / and % join."""
+        value = self.unary()
+        while operator := self.take("*", "/", "%"):
+            left, right = self.number(value), self.number(self.unary())
+            if operator == "*":
+                value = left * right
+            elif right == 0:
+                raise ZeroDivisionError
+            else:
+                value = left / right if operator == "/" else math.fmod(left, right)
+        return value
+
+    def unary(self) -> Value:
+        """Return the value of a factor with its signs."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
-            raise _SyntaxError(f"nested deeper than {MAX_DEPTH} levels")
-        node, is_condition = self.conjunction()
-        nodes = [node]
-        while self.next_is("or"):
-            nodes.append(self.conjunction()[0])
-        self.depth -= 1
-        if len(nodes) == 1:
-            return node, is_condition
-        return (lambda values: float(any(operand(values) != 0.0 for operand in nodes))), True
+            raise self.error("too many nested brackets or signs")
+        try:
+            if operator := self.take("-", "+", "not"):
+                value = self.unary()
+                if operator == "not":
+                    return not self.truth(value)
+                return -self.number(value) if operator == "-" else self.number(value)
+            return self.primary()
+        finally:
+            self.depth -= 1
 
-    def conjunction(self) -> tuple[_Node, bool]:
-        node, is_condition = self.negation()
-        nodes = [node]
-        while self.next_is("and"):
-            nodes.append(self.negation()[0])
-        if len(nodes) == 1:
-            return node, is_condition
-        return (lambda values: float(all(operand(values) != 0.0 for operand in nodes))), True
-
-    def negation(self) -> tuple[_Node, bool]:
-        is_negated, is_condition = False, False
-        while self.next_is("not"):
-            is_negated, is_condition = not is_negated, True
-        node, is_comparison = self.comparison()
-        if not is_condition:
-            return node, is_comparison
-        return (lambda values: float((node(values) == 0.0) is is_negated)), True
-
-    def comparison(self) -> tuple[_Node, bool]:
-        node, is_condition = self.sum()
-        if sign := self.next_is(*_COMPARISONS):
-            node, is_condition = _compare(_COMPARISONS[sign], node, self.sum()[0]), True
-            if self.position < len(self.tokens) and self.tokens[self.position] in _COMPARISONS:
-                raise _SyntaxError("comparisons do not chain; join them with 'and'")
-        return node, is_condition
-
-    def sum(self) -> tuple[_Node, bool]:
-        return self.chain(self.product, "+", "-")
-
-    def product(self) -> tuple[_Node, bool]:
-        return self.chain(self.signed, "*", "/", "%")
-
-    def chain(self, operand: Callable[[], tuple[_Node, bool]], *signs: str) -> tuple[_Node, bool]:
-        """Parse operands with operators of equal rank between them, which apply from left to right."""
-        first, is_condition = operand()
-        steps: list[tuple[Callable[[float, float], float], _Node]] = []
-        while sign := self.next_is(*signs):
-            steps.append((_OPERATIONS[sign], operand()[0]))
-
-        def result(values: Mapping[str, float]) -> float:
-            # A loop and not nested calls: a long sum must not reach Python's limit of recursion.
-            total = first(values)
-            for operation, node in steps:
-                total = operation(total, node(values))
-            return total
-
-        return (result, False) if steps else (first, is_condition)
-
-    def signed(self) -> tuple[_Node, bool]:
-        is_negative, is_signed = False, False
-        while sign := self.next_is("-", "+"):
-            is_negative, is_signed = is_negative != (sign == "-"), True
-        node, is_condition = self.atom()
-        if is_negative:
-            return (lambda values: -node(values)), False
-        return node, is_condition and not is_signed
-
-    def atom(self) -> tuple[_Node, bool]:
-        if self.position >= len(self.tokens):
-            raise _SyntaxError("it ends too early" if self.tokens else "it is empty")
-        token = self.tokens[self.position]
-        self.position += 1
-        if token == "(":
-            node = self.disjunction()
+    def primary(self) -> Value:
+        """Return the value of a number, a name, a function or a bracket."""
+        if self.take("("):
+            value = self.disjunction()
             self.expect(")")
-            return node
-        if token[0].isdigit() or token[0] == ".":
-            number = float(token)
-            if math.isinf(number):
-                raise _SyntaxError(f"{token} is too large for a number")
-            return (lambda values: number), False
-        if token in ("and", "or", "not") or not (token[0] in "$_" or token[0].isalpha()):
-            raise _SyntaxError(f"unexpected '{token}'")
-        if token in FUNCTIONS and self.next_is("("):
-            return self.call(token), False
-        name = token.removeprefix("$")
-        if self.position < len(self.tokens) and self.tokens[self.position] == "(":
-            raise _SyntaxError(f"unknown function '{name}'; known: {', '.join(FUNCTIONS)}")
-        self.names.append(name)
-        return (lambda values: values[name] if name in values else _CONSTANTS[name]), token in ("true", "false")
+            return value
+        if self.index >= len(self.tokens):
+            raise self.error("it ends too early")
+        group, text = self.tokens[self.index]
+        self.index += 1
+        if group == "number":
+            return int(text) if text.isdecimal() else float(text)
+        is_call = self.index < len(self.tokens) and self.tokens[self.index] == ("sign", "(")
+        is_bare_name = self.bare_names and text not in RESERVED and not is_call
+        if group == "name" or (group == "word" and is_bare_name):
+            try:
+                value = self.lookup(text)
+            except KeyError:
+                raise self.error(f"there is no parameter '{text}'") from None
+            return number_or_text(value) if isinstance(value, str) else value
+        if group == "word" and text in _CONSTANTS:
+            return _CONSTANTS[text]
+        if group == "word" and text in _FUNCTIONS:
+            return self.call(text)
+        if group == "word" and self.bare_names and text not in RESERVED:
+            raise self.error(f"there is no function '{text}'; functions: {', '.join(_FUNCTIONS)}")
+        if group == "word" and not self.bare_names:
+            known = ", ".join(_FUNCTIONS)
+            raise self.error(f"'{text}' is no function or constant; functions: {known}; parameters are written $name")
+        raise self.error(f"'{text}' is not expected there")
 
-    def call(self, name: str) -> _Node:
-        function, fewest, most = FUNCTIONS[name]
-        arguments = [self.disjunction()[0]]
-        while self.next_is(","):
-            arguments.append(self.disjunction()[0])
+    def call(self, name: str) -> Value:
+        """Return the value of a function of the arguments that follow."""
+        count, function = _FUNCTIONS[name]
+        self.expect("(")
+        arguments = [self.number(self.disjunction())]
+        while self.take(","):
+            arguments.append(self.number(self.disjunction()))
         self.expect(")")
-        if not fewest <= len(arguments) <= most:
-            raise _SyntaxError(f"{name} takes {fewest} argument{'s' if fewest > 1 else ''}, not {len(arguments)}")
-        return lambda values: function(*(argument(values) for argument in arguments))
+        if len(arguments) != count and not (name in ("max", "min") and len(arguments) > 1):
+            raise self.error(f"{name} takes {count} arguments, not {len(arguments)}")
+        return function(*arguments)
 
-    def expect(self, token: str) -> None:
-        if not self.next_is(token):
-            where = f"before '{self.tokens[self.position]}'" if self.position < len(self.tokens) else "at the end"
-            raise _SyntaxError(f"'{token}' is missing {where}")
-
-
-def _tokens(text: str) -> Iterator[str]:
-    position = 0
-    text = text.rstrip()
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if match is None:
-            raise _SyntaxError(f"unexpected '{text[position:].lstrip()[:1]}'")
-        yield match.group().strip()
-        position = match.end()
-
-
-def _compare(operation: Callable[[float, float], bool], left: _Node, right: _Node) -> _Node:
-    return lambda values: float(operation(left(values), right(values)))
+    def expect(self, text: str) -> None:
+        """Consume a sign. ConfigError if another token comes."""
+        if not self.take(text):
+            raise self.error(f"'{text}' is missing")
