@@ -1,5 +1,7 @@
 """Expressions over named values: the grammar of OpenSCENARIO XML 1.1 and later, with its extensions in use.
 
+SSAD's scenario files use the same grammar, in which names also stand alone: `2 * speed + 5` is `${2 * $speed + 5}`.
+
     expression := or ; or := and ("or" and)* ; and := comparison ("and" comparison)*
     comparison := sum (("<" | "<=" | ">" | ">=" | "==" | "!=") sum)?
     sum := product (("+" | "-") product)* ; product := unary (("*" | "/" | "%") unary)*
@@ -16,7 +18,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
 from typing import Final
 
 from ssad.core.errors import ConfigError
@@ -62,6 +65,8 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., float]]]] = {
     "exp": (1, math.exp),
     "log": (1, math.log),
 }
+RESERVED: Final = frozenset({"and", "or", "not", "true", "false", "pi"})
+"""Words that no parameter can have as its name."""
 _COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "<": lambda a, b: a < b,
     "<=": lambda a, b: a <= b,
@@ -70,13 +75,14 @@ _COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
 }
 
 
-def evaluate(expression: str, values: Mapping[str, Value] | Lookup) -> Value:
+def evaluate(expression: str, values: Mapping[str, Value] | Lookup, *, bare_names: bool = False) -> Value:
     """Evaluate an expression.
 
     Args:
         expression: The text, without the `${` and `}` around it.
         values: Value of each name, or a function that returns it and raises KeyError for an unknown name. A text that
             is a number or a truth value counts as one.
+        bare_names: Whether a name may stand without `$`.
 
     Returns:
         The value: a number, a truth value, or a text if the expression is a single name of a text.
@@ -86,7 +92,7 @@ def evaluate(expression: str, values: Mapping[str, Value] | Lookup) -> Value:
     """
     if len(expression) > MAX_LENGTH:
         raise ConfigError(f"an expression of {len(expression)} characters; at most {MAX_LENGTH} are read")
-    parser = _Parser(expression, values if callable(values) else values.__getitem__)
+    parser = _Parser(expression, values if callable(values) else values.__getitem__, bare_names)
     try:
         value = parser.parse()
     except ZeroDivisionError:
@@ -125,11 +131,102 @@ def text_of(value: Value) -> str:
     return str(value)
 
 
+class ParameterError(ConfigError):
+    """Error of the expression of a parameter.
+
+    Attributes:
+        name: The parameter.
+    """
+
+    def __init__(self, message: str, name: str) -> None:
+        super().__init__(message)
+        self.name = name
+
+
+def resolve_values(entries: Mapping[str, float | str], known_values: Mapping[str, float]) -> dict[str, float]:
+    """Return the values of parameters that may depend on one another, in any order.
+
+    Args:
+        entries: Parameter name -> number, or expression (see `number_of`) of other parameters.
+        known_values: Values of further names, for those that are not among the entries.
+
+    Returns:
+        Parameter name -> number, in the order of the entries.
+
+    Raises:
+        ParameterError: An expression is wrong, or a parameter depends on itself.
+    """
+    values: dict[str, float] = {}
+    chain: list[str] = []
+
+    def resolve(name: str) -> float:
+        if name not in entries:
+            return known_values[name]
+        if name in chain:
+            circle = " -> ".join([*chain[chain.index(name) :], name])
+            raise ParameterError(f"parameters depend on one another in a circle: {circle}", name)
+        if name not in values:
+            chain.append(name)
+            entry = entries[name]
+            try:
+                names = {*entries, *known_values}
+                values[name] = number_of(entry, resolve, names) if isinstance(entry, str) else float(entry)
+            except ParameterError:
+                raise
+            except ConfigError as error:
+                raise ParameterError(str(error), name) from None
+            chain.pop()
+        return values[name]
+
+    for name in entries:
+        resolve(name)
+    return {name: values[name] for name in entries}
+
+
+def number_of(text: str, values: Mapping[str, float] | Lookup, names: Iterable[str] = ()) -> float:
+    """Return the number that an expression of a scenario file states.
+
+    Args:
+        text: The expression, with or without `${` and `}` around it; names may stand without `$`.
+        values: Value of each name, as for `evaluate`.
+        names: Names that are suggested for an unknown one; empty: those of a mapping of values.
+
+    Raises:
+        ConfigError: As for `evaluate`, or the value is no number. The message has the values of its names.
+    """
+    body = text.strip()
+    if body.startswith("${") and body.endswith("}") and "}" not in body[2:-1]:
+        body = body[2:-1]
+    lookup = values if callable(values) else values.__getitem__
+    used_values: dict[str, Value] = {}
+
+    def recording_lookup(name: str) -> Value:
+        try:
+            used_values[name] = lookup(name)
+        except KeyError:
+            known_names = sorted({*names} or (set() if callable(values) else {*values}))
+            suggestions = ", ".join(get_close_matches(name, known_names, n=3, cutoff=0.0))
+            hint = f"; closest: {suggestions}" if suggestions else ", and none is declared"
+            raise ConfigError(f"expression '{text.strip()[:80]}': there is no parameter '{name}'{hint}") from None
+        return used_values[name]
+
+    try:
+        value = evaluate(body, recording_lookup, bare_names=True)
+    except ParameterError:
+        raise
+    except ConfigError as error:
+        listed = ", ".join(f"{name} = {text_of(value)}" for name, value in used_values.items())
+        raise ConfigError(f"{error}{f', where {listed}' if listed else ''}") from None
+    if isinstance(value, str):
+        raise ConfigError(f"expression '{text.strip()[:80]}': '{value[:40]}' is not a number")
+    return float(value)
+
+
 class _Parser:
     """Recursive descent over the tokens of one expression, which evaluates as it goes."""
 
-    def __init__(self, expression: str, lookup: Lookup) -> None:
-        self.expression, self.lookup = expression, lookup
+    def __init__(self, expression: str, lookup: Lookup, bare_names: bool) -> None:
+        self.expression, self.lookup, self.bare_names = expression, lookup, bare_names
         self.tokens: list[tuple[str, str]] = []
         self.index = self.depth = 0
         position = 0
@@ -249,7 +346,9 @@ class _Parser:
         self.index += 1
         if group == "number":
             return int(text) if text.isdecimal() else float(text)
-        if group == "name":
+        is_call = self.index < len(self.tokens) and self.tokens[self.index] == ("sign", "(")
+        is_bare_name = self.bare_names and text not in RESERVED and not is_call
+        if group == "name" or (group == "word" and is_bare_name):
             try:
                 value = self.lookup(text)
             except KeyError:
@@ -259,7 +358,9 @@ class _Parser:
             return _CONSTANTS[text]
         if group == "word" and text in _FUNCTIONS:
             return self.call(text)
-        if group == "word":
+        if group == "word" and self.bare_names and text not in RESERVED:
+            raise self.error(f"there is no function '{text}'; functions: {', '.join(_FUNCTIONS)}")
+        if group == "word" and not self.bare_names:
             known = ", ".join(_FUNCTIONS)
             raise self.error(f"'{text}' is no function or constant; functions: {known}; parameters are written $name")
         raise self.error(f"'{text}' is not expected there")
