@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import rich.table
 from pydantic import ValidationError
 
 from ssad.core import safeio
@@ -23,7 +22,7 @@ from ssad.report.load import Run, load_run
 from ssad.report.markdown import run_markdown
 from ssad.report.pages import TABLE_HASH, table_hash
 from ssad.report.tables import write_tables
-from ssad.report.terminal import terminal_table
+from ssad.report.terminal import TerminalTable, terminal_table
 from ssad.report.verdict import complete_verdict
 
 
@@ -124,7 +123,7 @@ def report_markdown(folders: Sequence[Path | str]) -> str:
         return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
 
 
-def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
+def summary(folder: Path | str, kind: Kind | None = None) -> TerminalTable:
     """Main table of a run for the terminal: n and interval of the first metric, the values of the others.
 
     Args:
