@@ -27,7 +27,7 @@ from ssad.core.types import Episode, Pose, Scenario
 from ssad.interchange.export import ExportedFiles, episode
 from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
-from ssad.interchange.openscenario_places import AttributeReader
+from ssad.interchange.openscenario_document import AttributeReader
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE
 from ssad.scenarios.dynamic.importer import free_drive
@@ -90,7 +90,7 @@ def read_leaderboard(
     root = read_xml(path, limit=MAX_BYTES)
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
-    values, omissions, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
+    values, omissions, scenarios = AttributeReader(str(path)), Counter[str](), list[Scenario]()
     towns = town_names()
     routes = root.findall("route")
     for route_number, route in enumerate(routes):
