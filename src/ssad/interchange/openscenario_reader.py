@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ssad.core.errors import FormatError, RouteError
+from ssad.core.errors import FormatError, RouteError, SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Actor, EpisodeLimits, Pose, Route, Scenario, SignalPlan, SignalState
+from ssad.core.types import F64, Actor, EpisodeLimits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_distributions import parameter_sets, scenario_file
 from ssad.interchange.openscenario_document import AttributeReader, ConstraintError, read_document, resolve
@@ -44,7 +44,7 @@ STEP: Final = 0.1  # s of the world
 WAY: Final = 200.0  # m, shortest path along its lane of an agent without a route
 LONGEST_WAY: Final = 3000.0  # m
 DEFAULT_TIME: Final = 60.0  # s of a scenario that states no time
-MARGIN: Final = 5.0  # m of the path behind an agent's start
+FAR_OFF: Final = 5.0  # m from the ego's route of a point that it does not pass
 
 
 @dataclass(frozen=True)
@@ -277,8 +277,13 @@ class _Reader:
             ego_body=self.ego.body,
             friction=self._friction(),
         )
+        for entity in self.entities.values():
+            entity.phases = self._with_meetings(entity, ego_route)
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
-        build_episode(scenario, self.graph, seed=0)  # reports any remaining error of the scenario
+        try:
+            build_episode(scenario, self.graph, seed=0)
+        except SSADError as error:
+            raise type(error)(f"{self.values.location}: {error}") from None
         for message, times in self.omissions.items():
             self.report.omissions.setdefault(message, []).extend([""] * times)
         return scenario
@@ -319,14 +324,16 @@ class _Reader:
 
     def _limits(self) -> EpisodeLimits:
         limits = EpisodeLimits()
-        trigger = self.root.find("Storyboard/StopTrigger")
-        conditions = [] if trigger is None else trigger.findall("ConditionGroup/Condition")
+        groups = self.root.findall("Storyboard/StopTrigger/ConditionGroup")
+        conditions = [condition for group in groups for condition in group]
+        # A condition that must hold together with others says nothing of its own.
+        alone = [group[0] for group in groups if len(group) == 1]
         times: list[float] = []
         for condition in conditions:
             name = condition.get("name", "")
             time_condition = condition.find("ByValueCondition/SimulationTimeCondition")
             distance_condition = condition.find("ByEntityCondition/EntityCondition/TraveledDistanceCondition")
-            if time_condition is not None:
+            if time_condition is not None and condition in alone:
                 value = self.values.number(time_condition, "value") + self.values.number(condition, "delay", 0.0)
                 if name == "max_steps":
                     limits = replace(limits, max_steps=round(value / STEP))
@@ -334,11 +341,11 @@ class _Reader:
                     limits = replace(limits, max_time=value)
                 else:
                     times.append(value)
-            elif distance_condition is not None:
+            elif distance_condition is not None and condition in alone:
                 limits = replace(limits, max_distance=max(self.values.number(distance_condition, "value"), 1.0))
             elif name != "end of the route" and condition.find(".//CollisionCondition") is None:
                 condition_tags = [element.tag for element in condition.iter() if element.tag.endswith("Condition")]
-                self.omissions[f"{condition_tags[-1]} of the stop trigger"] += 1
+                self.omissions[f"{condition_tags[-1] if condition_tags else 'a condition'} of the stop trigger"] += 1
         if times:
             time = max(min(times), STEP)
             limits = replace(limits, max_time=time, max_steps=math.ceil(time / STEP))
@@ -357,14 +364,16 @@ class _Reader:
         start = self.places.start(self.ego.name, within=self.ego.element)
         points = self.ego.route
         if not points and self.ego.path:
-            points = self._along_trajectory(self.ego.path)
+            first, trajectory = self.ego.path[0], self.ego.path
+            begins_here = math.dist((first.x, first.y), (start.x, start.y)) < FAR_OFF
+            points = self._along_trajectory(trajectory if begins_here else (start, *trajectory))
         if len(points) > 1:
             return points
         start_lane = self._start_lane(start)
         if points:
             return (start, *points)
         way = self._way(max(self.ego.speed, self.ego.target_speed), limits)
-        self.report.note(f"the ego has no route: {way:.0f} m along its lane")
+        self.report.note("the ego has no route: it follows its lane", f"{way:.0f} m")
         path = lane_path(self.graph, start_lane, way)
         if len(path) < 3:
             raise RouteError(f"{self.values.location}: the road ends before the ego '{self.ego.name}'")
@@ -389,6 +398,19 @@ class _Reader:
                 return points
         self.omissions[f"the trajectory of the ego '{self.ego.name}', which the town's lanes do not allow"] += 1
         return ()
+
+    def _with_meetings(self, entity: Entity, route: Route) -> list[Phase]:
+        """Return the phases of an entity without meetings at points that the ego's route does not pass."""
+        line = route.xy.astype(np.float64)
+        phases = []
+        for phase in entity.phases:
+            arrival, kept = phase.arrival, phase
+            is_of_ego = arrival is not None and arrival.reference == "ego"
+            if arrival is not None and is_of_ego and _distance(line, arrival.reference_point) > FAR_OFF:
+                self.omissions[f"'{entity.name}' meets the ego at a point that its route does not pass"] += 1
+                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(kept)
+        return phases
 
     def _actors(self, limits: EpisodeLimits) -> list[Actor]:
         end_time = min(limits.max_steps * STEP, limits.max_time)
@@ -417,15 +439,31 @@ class _Reader:
             path = tuple((point.x, point.y) for point in entity.route) if len(entity.route) > 1 else ()
             speed = min(max(entity.target_speed, 0.1), entity.max_speed)
             return Actor(entity.name, entity.model, pose, path=path, policy=entity.policy, target_speed=speed)
+        path = self._path(entity, pose, limits) if moves else ()
         return Actor(
             entity.name,
             entity.model,
             pose,
-            phases=tuple(entity.phases),
+            phases=self._with_own_meetings(entity, pose, path),
             lateral=tuple(entity.lateral),
-            path=self._path(entity, pose, limits) if moves else (),
+            path=path,
             speed=min(entity.speed, entity.max_speed),
         )
+
+    def _with_own_meetings(
+        self, entity: Entity, pose: Pose, path: tuple[tuple[float, float], ...]
+    ) -> tuple[Phase, ...]:
+        """Return the phases of an entity without meetings at points that its own path does not pass."""
+        ahead = move_pose(pose, LONGEST_WAY, 0.0)
+        line = np.array(path if len(path) > 1 else ((pose.x, pose.y), (ahead.x, ahead.y)))
+        phases = []
+        for phase in entity.phases:
+            kept = phase
+            if phase.arrival is not None and _distance(line, phase.arrival.point) > FAR_OFF:
+                self.omissions[f"'{entity.name}' meets another at a point that its path does not pass"] += 1
+                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(kept)
+        return tuple(phases)
 
     def _on_trajectory(self, entity: Entity, pose: Pose, until: float) -> Actor:
         """Return an actor that follows the trajectory of an entity."""
@@ -505,6 +543,13 @@ class _Reader:
         if plan is None:
             self.omissions[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
+
+
+def _distance(line: F64, point: tuple[float, float]) -> float:
+    """Return the distance of a point from a polyline [n, 2], m."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    share = np.clip(((point - start) * step).sum(1) / np.maximum((step**2).sum(1), 1e-9), 0.0, 1.0)
+    return float(np.hypot(*(start + share[:, None] * step - point).T).min())
 
 
 def _length(points: tuple[Pose, ...]) -> float:

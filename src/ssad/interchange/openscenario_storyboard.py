@@ -426,7 +426,11 @@ class StoryboardReader:
         label = event.path[-1]
         if entity.ego:
             tags = {element.tag for element in (content, *content)}
-            if tags & set(_OF_DRIVER) - {"ControllerAction"}:
+            routing = content if content.tag == "RoutingAction" else content.find("RoutingAction")
+            trigger = self.start(event, entity)
+            if routing is not None and isinstance(trigger, PhaseTrigger) and not (entity.route or entity.path):
+                self._routing(entity, routing, action, trigger, f"event '{label}'")
+            elif tags & set(_OF_DRIVER) - {"ControllerAction"}:
                 self.omissions[f"event '{label}' of the ego: the system under test drives it"] += 1
             elif "ControllerAction" not in tags:
                 self.record_omission(f"in event '{label}'", content)
@@ -552,25 +556,65 @@ class StoryboardReader:
         if master_name not in self.entities:
             raise self.values.error(action, f"there is no entity '{master_name}'")
         master = self.entities[master_name]
-        positions = []
+        poses = []
         for tag, body in (("TargetPosition", entity), ("TargetPositionMaster", master)):
             position = action.find(tag)
             if not self.places.is_supported(position):
                 self.omissions[f"SynchronizeAction of '{entity.name}': a position that is not read"] += 1
                 return []
-            pose = self._centre(body, self.places.pose(position, within=action))
-            positions.append((pose.x, pose.y))
+            poses.append(self._centre(body, self.places.pose(position, within=action)))
         absolute = action.find("FinalSpeed/AbsoluteSpeed")
-        relative = action.find("FinalSpeed/RelativeSpeedToMaster")
         speed: float | None = None
         if absolute is not None:
             speed = self._limited_speed(entity, self.values.number(absolute, "value"))
-            if len(absolute):
-                self.omissions[f"'{entity.name}' has its final speed at the meeting point, not some way before it"] += 1
-        elif relative is not None:
+            poses = self._before_steady_state(action, poses, speed=speed, master=master)
+        elif action.find("FinalSpeed/RelativeSpeedToMaster") is not None:
             self.omissions[f"the final speed of '{entity.name}', which depends on that of '{master.name}'"] += 1
-        arrival = Arrival(positions[0], positions[1], self.triggers.agent_name(master))
-        return [Phase(speed, arrival=arrival)]
+        own, other = ((pose.x, pose.y) for pose in poses)
+        return [Phase(speed, arrival=Arrival(own, other, self.triggers.agent_name(master)))]
+
+    def _before_steady_state(self, action: Element, poses: list[Pose], *, speed: float, master: Entity) -> list[Pose]:
+        """Return the places of a meeting, or those at which the steady state before it begins.
+
+        From there on the entity keeps its final speed; the other one is taken to keep its speed at the start.
+        """
+        by_distance = action.find("FinalSpeed/AbsoluteSpeed/TargetDistanceSteadyState")
+        by_time = action.find("FinalSpeed/AbsoluteSpeed/TargetTimeSteadyState")
+        if by_distance is not None:
+            distance = self.values.number(by_distance, "distance")
+        elif by_time is not None:
+            distance = self.values.number(by_time, "time") * speed
+        else:
+            return poses
+        if speed <= 0.0 or distance <= 0.0:
+            return poses
+        own, other = poses
+        back = master.speed * distance / speed
+        start = self._centre(master, self.places.start(master.name, within=action))
+        if back <= 0.0 or back >= math.dist((start.x, start.y), (other.x, other.y)):
+            self.omissions[f"the steady state before the meeting with '{master.name}'"] += 1
+            return poses
+        return [
+            self._earlier(action.find("TargetPosition"), own, distance),
+            self._earlier(action.find("TargetPositionMaster"), other, back),
+        ]
+
+    def _earlier(self, position: Element | None, pose: Pose, distance: float) -> Pose:
+        """Return the pose that lies a distance before one: on the trajectory or route of its position, or its lane."""
+        content = None if position is None else next(iter(position), None)
+        trajectory = None if content is None else content.find("TrajectoryRef/Trajectory")
+        route = None if content is None else content.find("RouteRef/Route")
+        if trajectory is not None or route is not None:
+            way = self.places.route(route) if trajectory is None and route is not None else None
+            way = way or self.places.trajectory(trajectory)  # type: ignore[arg-type]
+            return way.before(pose, distance)
+        place = self.places.lane_under(pose)
+        if place is None:
+            return move_pose(pose, -distance, 0.0)
+        graph = self.places.graph
+        centre = pose_at(graph, place)
+        aside = -math.sin(centre.yaw) * (pose.x - centre.x) + math.cos(centre.yaw) * (pose.y - centre.y)
+        return move_pose(pose_at(graph, place_behind(graph, place, distance)), 0.0, aside)
 
     # ------------------------------------------------------------ lateral actions
 

@@ -49,6 +49,14 @@ class SampledTrajectory:
         yaw = float(self.yaw[index]) + share * turn
         return Pose(x - t * math.sin(yaw), y + t * math.cos(yaw), yaw)
 
+    def before(self, pose: Pose, distance: float) -> Pose:
+        """Return the pose that lies a distance before the place nearest to a pose."""
+        nearest = int(np.argmin(np.hypot(self.xy[:, 0] - pose.x, self.xy[:, 1] - pose.y)))
+        direction = float(self.yaw[nearest])
+        x, y = self.xy[nearest].tolist()
+        ahead = math.cos(direction) * (pose.x - x) + math.sin(direction) * (pose.y - y)
+        return self.at(float(self.s[nearest]) + ahead - distance)
+
 
 def sample_trajectory(trajectory: Element, values: AttributeReader, pose: PoseReader) -> SampledTrajectory:
     """Sample a trajectory.

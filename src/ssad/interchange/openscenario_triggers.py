@@ -166,7 +166,7 @@ class TriggerReader:
         if content.tag == "StoryboardElementStateCondition":
             result = self._element_state(content, label)
         elif condition.find("ByEntityCondition") is not None:
-            result = self._by_entity(condition, content, entity)
+            result = self._by_entity(condition, content, entity, label)
         else:
             result = self._by_value(content, label)
         if result is Unfulfilled.UNKNOWN:
@@ -230,33 +230,33 @@ class TriggerReader:
 
     # ------------------------------------------------------------ conditions on entities
 
-    def _by_entity(self, condition: Element, content: Element, entity: Entity | None) -> Trigger:
+    def _by_entity(self, condition: Element, content: Element, entity: Entity | None, label: str) -> Trigger:
         triggering = [self.referenced_entity(item) for item in condition.iterfind(".//TriggeringEntities/EntityRef")]
         if not triggering:
             raise self.values.error(condition, "TriggeringEntities is missing or empty")
-        parts = [self._of_entity(content, agent, entity) for agent in triggering]
+        parts = [self._of_entity(content, agent, entity, label) for agent in triggering]
         element = condition.find(".//TriggeringEntities")
         rule = "any" if element is None else self.values.text(element, "triggeringEntitiesRule", "any")
         return all_of(parts) if rule == "all" else any_of(parts)
 
-    def _of_entity(self, content: Element, agent: Entity, entity: Entity | None) -> Trigger:
+    def _of_entity(self, content: Element, agent: Entity, entity: Entity | None, label: str) -> Trigger:
         name = "" if agent is entity else self.agent_name(agent)
         if self.values.text(content, "direction", "longitudinal") != "longitudinal":
             return Unfulfilled.UNKNOWN
         simple = {"TraveledDistanceCondition": "travelled", "SpeedCondition": "speed"}
         simple["AccelerationCondition"] = "acceleration"
         if content.tag in simple:
-            return self._compared(PhaseTrigger(simple[content.tag], agent=name), content)  # type: ignore[arg-type]
+            return self._compared(PhaseTrigger(simple[content.tag], agent=name), content, label)  # type: ignore[arg-type]
         if content.tag == "StandStillCondition":
             return PhaseTrigger("standstill", self.values.number(content, "duration"), agent=name)
         if content.tag == "RelativeSpeedCondition":
             reference = self._reference(content, agent, entity)
-            return self._compared(PhaseTrigger("relative_speed", agent=name, reference=reference), content)
+            return self._compared(PhaseTrigger("relative_speed", agent=name, reference=reference), content, label)
         if content.tag in ("RelativeDistanceCondition", "TimeHeadwayCondition"):
             kind = "distance" if content.tag == "RelativeDistanceCondition" else "time_headway"
             result = PhaseTrigger(kind, agent=name, reference=self._reference(content, agent, entity))  # type: ignore[arg-type]
             other = self.referenced_entity(content)
-            return self._ego_distance(self._compared(self._measured(result, content), content), agent, other)
+            return self._ego_distance(self._compared(self._measured(result, content), content, label), agent, other)
         if content.tag == "TimeToCollisionCondition":
             target = content.find("TimeToCollisionConditionTarget")
             entity_ref = None if target is None else target.find("EntityRef")
@@ -268,7 +268,7 @@ class TriggerReader:
                 if not self.places.is_supported(position):
                     return Unfulfilled.UNKNOWN
                 result = replace(result, position=self._point(position, content, agent))
-            return self._compared(self._measured(result, content), content)
+            return self._compared(self._measured(result, content), content, label)
         if content.tag in ("ReachPositionCondition", "DistanceCondition"):
             position = content.find("Position")
             if not self.places.is_supported(position):
@@ -278,7 +278,7 @@ class TriggerReader:
                 tolerance = self.values.number(content, "tolerance")
                 return PhaseTrigger("position", tolerance, agent=name, position=point)
             result = self._measured(PhaseTrigger("distance", agent=name, position=point), content)
-            return self._compared(result, content)
+            return self._compared(result, content, label)
         if content.tag == "CollisionCondition":
             entity_ref = content.find("EntityRef")
             if entity_ref is None:
@@ -313,7 +313,7 @@ class TriggerReader:
         measure = "lateral" if distance_type == "lateral" else "road" if along else "straight"
         return replace(trigger, free_space=free_space, measure=measure)  # type: ignore[arg-type]
 
-    def _compared(self, trigger: PhaseTrigger, content: Element) -> Trigger:
+    def _compared(self, trigger: PhaseTrigger, content: Element, label: str) -> Trigger:
         """Return a trigger with the value and the rule of a condition."""
         value = self.values.number(content, "value")
         rule = self._rule(content) or ("greaterThan" if trigger.kind == "travelled" else "")
@@ -321,6 +321,9 @@ class TriggerReader:
         if rule in _ABOVE or (rule == "equalTo" and trigger.kind == "travelled"):
             return replace(trigger, value=value, rule="" if is_rising_kind else "above")
         if rule in _BELOW:
+            if value <= 0.0 and trigger.kind not in ("relative_speed", "acceleration"):
+                self._never(content, label, f"{content.tag} is never below {value:g}")
+                return Unfulfilled.NEVER
             return replace(trigger, value=value, rule="below" if is_rising_kind else "")
         if rule == "equalTo":
             above = replace(trigger, value=value - EQUAL, rule="above")
