@@ -15,6 +15,7 @@ from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import (
     Actor,
     EpisodeLimits,
+    LateralPhase,
     Phase,
     PhaseTrigger,
     Pose,
@@ -39,6 +40,7 @@ from ssad.world.models import MODELS
 
 number = st.floats(-1.0e5, 1.0e5, allow_subnormal=False)
 positive = st.floats(1e-3, 1.0e4)
+jerks = st.floats(1e-3, 100.0)
 poses = st.builds(Pose, number, number, number)
 light = st.sampled_from(["program", "off", "red", "green"])
 texts = st.text(max_size=20).filter(lambda t: all(c.isprintable() for c in t))
@@ -55,10 +57,26 @@ def scenarios(draw: st.DrawFn) -> Scenario:
             positive,
             st.just(0),
         )
-        phase = st.builds(Phase, st.floats(0.0, 1.0).map(float), condition)
+        groups = st.lists(condition | st.builds(PhaseTrigger, all=st.tuples(condition, condition)), max_size=3).map(
+            tuple
+        )
+        paced = st.fixed_dictionaries({}, optional={"acceleration": positive.map(lambda a: min(a, 9.0)), "jerk": jerks})
+        phase = st.tuples(st.builds(Phase, st.floats(0.0, 1.0).map(float), condition), paced).map(
+            lambda pair: replace(pair[0], **pair[1])
+        )
         body = st.sampled_from([m for m in MODELS if MODELS[m].max_speed >= 1.0])
         path = st.lists(st.tuples(number, number), min_size=2, max_size=4).map(tuple)
-        actor = st.builds(Actor, texts, body, poses, st.lists(phase, max_size=3).map(tuple), path)
+        swerve = st.builds(LateralPhase, st.integers(-3, 3), st.floats(-5.0, 5.0), st.builds(PhaseTrigger, any=groups))
+        actor = st.builds(
+            Actor,
+            texts,
+            body,
+            poses,
+            st.lists(phase, max_size=3).map(tuple),
+            path,
+            speed=st.floats(0.0, 1.0),
+            lateral=st.lists(swerve, max_size=2).map(tuple),
+        )
         actors = tuple(draw(st.lists(actor, min_size=1, max_size=3)))
     box = parameter_box(kind)
     chosen = draw(st.sets(st.sampled_from(sorted(box))))
