@@ -44,6 +44,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
                 target_speed=max((phase.speed or 0.0 for phase in actor.phases), default=actor.speed),
                 phases=actor.phases,
                 route=actor_route,
+                body=actor.body,
                 lateral=actor.lateral,
                 lateral_targets=targets,
             )
@@ -86,6 +87,7 @@ def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
         target_speed=actor.target_speed,
         route=route,
         policy=actor.policy,
+        body=actor.body,
     )
 
 
@@ -100,7 +102,13 @@ def _recorded(actor: Actor) -> EpisodeAgent:
     pose = Pose(x + fraction * (x1 - x), y + fraction * (y1 - y), heading)
     speed = ((x1 - x) * np.cos(heading) + (y1 - y) * np.sin(heading)) / (t1 - t)
     return EpisodeAgent(
-        actor.name, actor.model, Controller.TRAJECTORY, pose, speed=float(speed), trajectory=actor.trajectory
+        actor.name,
+        actor.model,
+        Controller.TRAJECTORY,
+        pose,
+        speed=float(speed),
+        trajectory=actor.trajectory,
+        body=actor.body,
     )
 
 
