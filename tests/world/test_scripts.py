@@ -15,6 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.triggers import trigger_groups
 from ssad.core.types import (
     Arrival,
+    Body,
     Controller,
     Episode,
     EpisodeAgent,
@@ -117,6 +118,23 @@ def test_jerk_stays_within_its_limit(speeds: dict[str, np.ndarray], name: str) -
         # at 1.6 s, 12.55 m/s and 3 m/s^2: turned round in 3 s at the same speed, held, and taken back over 2.25 m/s
         expected = 1.6 + 3.0 + (12.55 - 2.25 - 5.0) / 3.0 + 1.5
         assert np.flatnonzero(speed[16:] < 5.0 + 1e-3)[0] + 16 == np.ceil(expected / DT)
+
+
+def test_only_full_braking_depends_on_the_brakes_and_the_road() -> None:
+    """50 km/h: v^2 / 2a + v t / 2 with a build-up time t; a stated deceleration is driven whatever they allow."""
+    speed, slow = 50.0 / 3.6, Body(brake_build_up=0.3)
+    full, stated = (Phase(0.0),), (Phase(0.0, acceleration=9.5),)
+    agents = [
+        scripted(f"{number}", 50.0, 10.0 * (number + 2), speed=speed, phases=phases, body=body)
+        for number, (phases, body) in enumerate([(full, Body()), (full, slow), (stated, slow)])
+    ]
+    dry, ice = (episode(ego(), *agents, limits=ON, friction=friction) for friction in (0.9, 0.3))
+    result = drive([dry, ice], 70)
+    way = result["pose"][-1, :, 1:, 0] - 50.0
+    dry_way, icy_way = speed**2 / (2.0 * 8.0), speed**2 / (2.0 * 0.3 * 9.81)
+    stated_way = speed**2 / (2.0 * 9.5)
+    np.testing.assert_allclose(way[0], [dry_way, dry_way + 0.3 * speed / 2.0, stated_way], rtol=0.02)
+    np.testing.assert_allclose(way[1, [0, 2]], [icy_way, stated_way], rtol=0.02)
 
 
 def test_courses_follow_their_formulae(speeds: dict[str, np.ndarray]) -> None:
