@@ -79,7 +79,15 @@ NOMINAL = {
 
 
 # fields that came later: at their defaults they change nothing
-LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None}
+LATER = {
+    "trajectory": (),
+    "contact": "end",
+    "policy": "",
+    "draw": None,
+    "declared": {},
+    "expressions": {},
+    "constraints": (),
+}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 
