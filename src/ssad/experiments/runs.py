@@ -21,6 +21,7 @@ from ssad.experiments.suites import kind_of
 from ssad.report.join import join_runs
 from ssad.report.load import Run, load_run
 from ssad.report.markdown import run_markdown
+from ssad.report.matrix import run_matrices, sweep_tables, terminal_matrices
 from ssad.report.pages import TABLE_HASH, table_hash
 from ssad.report.tables import write_tables
 from ssad.report.terminal import terminal_table
@@ -100,7 +101,8 @@ def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
     run = load_run(folder)
     with _read_as_kind(run):
         page, tables = (kind or kind_of_run(run)).page(run)
-    write_tables(run.folder, tables)
+        all_tables = [*tables, *sweep_tables(run)]
+    write_tables(run.folder, all_tables)
     page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
@@ -121,7 +123,7 @@ def report_markdown(folders: Sequence[Path | str]) -> str:
     kind = kind_of_run(run)
     with _read_as_kind(run):
         _, tables = kind.page(run)
-        return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
+        return run_markdown(run, [*tables, *run_matrices(run)], complete_verdict(run, kind.verdict(run)))
 
 
 def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
@@ -137,6 +139,17 @@ def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
     run = load_run(folder)
     with _read_as_kind(run):
         return terminal_table(run, (kind or kind_of_run(run)).summary(run))
+
+
+def matrices(folder: Path | str) -> list[rich.table.Table | str]:
+    """Return the matrices of a run with a sweep for the terminal, and their notes; empty: it has no sweep.
+
+    Raises:
+        StoreError: The folder holds no run with results.
+    """
+    run = load_run(folder)
+    with _read_as_kind(run):
+        return terminal_matrices(run)
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 import types
@@ -239,6 +240,83 @@ def _range_values(entry: Mapping[str, Any]) -> list[float]:
         count = math.floor((last - first) / step + _TOLERANCE) + 1
     # Rounding writes 0.3 where steps of 0.1 add up to 0.30000000000000004.
     return [float(f"{first + index * step:.12g}") for index in range(count)]
+
+
+@dataclasses.dataclass(frozen=True)
+class GridPoint:
+    """Scenario at a point of a grid.
+
+    Attributes:
+        scenario: The scenario, whose name ends with the values.
+        values: Parameter name -> value.
+    """
+
+    scenario: Scenario
+    values: Mapping[str, float]
+
+
+class GridError(ConfigError):
+    """Error of a grid; `name` is the parameter, empty if it concerns all."""
+
+    def __init__(self, message: str, name: str = "") -> None:
+        super().__init__(message)
+        self.name = name
+
+
+def grid_points(
+    scenario: Scenario, grids: Mapping[str, Sequence[float] | None], *, zipped: bool = False
+) -> tuple[GridPoint, ...]:
+    """Return a scenario at the points of a grid that meet its constraints.
+
+    Args:
+        scenario: The nominal scenario.
+        grids: Parameter name, or `target_speed` -> values (see `grid_values`); None: the grid that the scenario
+            declares for the parameter.
+        zipped: Whether the first values make the first point, the second ones the second, and so on; else all
+            combinations are points, of which the last parameter varies fastest.
+
+    Returns:
+        The points in their order.
+
+    Raises:
+        GridError: The scenario has no such parameter, a value is out of its range, the grid has too many points, or
+            none of them meets the constraints.
+    """
+    parameters = scenario_parameters(scenario)
+    axes: dict[str, Sequence[float]] = {}
+    for name, values in grids.items():
+        if name not in parameters and name != TARGET_SPEED:
+            known_names = ", ".join([*scenario.declared, *(n for n in parameters if n not in scenario.declared)])
+            raise GridError(f"scenario {scenario.name} has no such parameter; it has: {known_names}", name)
+        declared_grid = scenario.declared[name].grid if name in scenario.declared else ()
+        axes[name] = declared_grid if values is None else values
+        if not axes[name]:
+            raise GridError(f"scenario {scenario.name} declares no grid for it", name)
+        for value in axes[name]:
+            problem = parameters[name].problem(value) if name in parameters else None
+            if problem:
+                raise GridError(f"scenario {scenario.name}: {problem}", name)
+    lengths = {name: len(values) for name, values in axes.items()}
+    if zipped and len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise GridError(f"grids that are zipped have equally many values, not: {listed}")
+    if not zipped and math.prod(lengths.values()) > MAX_GRID:
+        raise GridError(f"{math.prod(lengths.values())} points; a sweep has at most {MAX_GRID}")
+    combinations = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
+    points = []
+    violation = None
+    for combination in combinations:
+        point = dict(zip(axes, combination, strict=True))
+        suffix = "/".join(f"{name}={text_of(value)}" for name, value in point.items())
+        member = dataclasses.replace(with_parameters(scenario, point), name=f"{scenario.name}/{suffix}")
+        violation = violated_constraint(member)
+        if violation is None:
+            points.append(GridPoint(member, point))
+    if not points:
+        raise GridError(
+            f"scenario {scenario.name}: no point meets the constraints; the last: {violation and violation[1]}"
+        )
+    return tuple(points)
 
 
 # ---------------------------------------------------------------- plain data

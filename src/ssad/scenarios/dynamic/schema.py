@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _DATA = (Scenario, Pose, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits, DeclaredParameter)
 _DERIVED = ("declared", "expressions")  # fields of a scenario that stand elsewhere in its file
-_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
+_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+=\-]*(/[A-Za-z0-9_][A-Za-z0-9_.:@+=\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
 _MAX_COORDINATE = 1.0e5
@@ -159,7 +159,7 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         Location of the value among the scenario's keys, and a message.
     """
     if not _NAME.match(scenario.name):
-        yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+/ between them"
+        yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+=/ between them"
     if not scenario.town:
         yield ("town",), "name the town (ssad list towns)"
     if len(scenario.route) < 2:
