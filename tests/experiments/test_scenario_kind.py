@@ -11,8 +11,8 @@ from rich.console import Console
 from ssad.core.errors import ConfigError
 from ssad.engine.kind import Plan, Resources
 from ssad.engine.run import run
-from ssad.experiments.runs import kind_of, matrices, read_plan, replay, write_report
-from ssad.experiments.suites import load_suite
+from ssad.experiments.runs import matrices, read_plan, replay, write_report
+from ssad.experiments.suites import kind_of, load_suite
 
 SCENARIO = """\
 name: my/crossing
@@ -146,7 +146,7 @@ def test_a_sweep_runs_with_a_matrix_and_replays(tmp_path: Path) -> None:
     assert page.count('class="data heat"') == 1
     assert "matrix.csv" in page
     assert len((folder / "tables" / "matrix.csv").read_text().splitlines()) == 1 + 3 * 3
-    *_, note = matrices(folder)
-    assert "n = 2 drives behind it in 1 cluster" in str(note)
+    (matrix,) = matrices(folder)
+    assert "n = 2 drives behind it in 1 cluster" in matrix.note
     drawn = next(cell.key for cell in read_plan(folder).cells if cell.name.endswith("#1"))
     assert replay(folder, drawn).difference is None

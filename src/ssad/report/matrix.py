@@ -6,21 +6,17 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeGuard
 
-import rich.table
-from rich import box
-from rich.markup import escape
-
 from ssad.metrics import METRICS
 from ssad.metrics.uncertainty import Kind
 from ssad.report.load import Run
 from ssad.report.records import Line, metric_cell
 from ssad.report.tables import Table, TableCell, TableRow
+from ssad.report.terminal import TerminalRow, TerminalTable
 
 SWEEP: Final = "sweep."
 """Start of the names of the fields that have the values of swept parameters."""
 MAX_SLICES: Final = 6
 """Most values of further parameters that have matrices of their own; over more of them the matrix is a mean."""
-WIDTH: Final = 80  # columns of a terminal
 EMPTY: Final = TableCell.value(None)
 NOTE: Final = (
     "Points of a grid share their route and their random draws: they are one cluster, and no interval is taken over "
@@ -217,49 +213,20 @@ def _with_unit(lines: Sequence[Line], parameter: str) -> str:
     return f"{parameter}, {unit}" if unit else parameter
 
 
-def terminal_matrices(run: Run) -> list[rich.table.Table | str]:
-    """Return the matrices of a run for the terminal, and their notes, each once; empty: it has no sweep."""
+def terminal_matrices(run: Run) -> list[TerminalTable]:
+    """Return the matrices of a run for the terminal, the last one with their notes; empty: it has no sweep."""
     tables = run_matrices(run)
-    parts: list[rich.table.Table | str] = [part for table in tables for part in _terminal_matrix(table)]
-    return parts + [escape(note) for note in dict.fromkeys(table.note for table in tables)]
-
-
-def _terminal_matrix(table: Table) -> list[rich.table.Table]:
-    """Return a matrix for the terminal: one above the other, parts of its columns that fit into its width."""
-    texts = [[matrix_text(cell, table) for cell in row.cells] for row in table.rows]
-    # Two spaces part the columns.
-    widths = [max(len(column), *(len(row[index]) for row in texts)) + 2 for index, column in enumerate(table.columns)]
-    # A long head takes several lines rather than the width of numbers.
-    words = table.heads[0].split()
-    head_width = max(min(len(table.heads[0]), 12), *map(len, words), *(len(row.head[0]) for row in table.rows))
-    parts: list[list[int]] = [[]]
-    for index, width in enumerate(widths):
-        if parts[-1] and head_width + sum(widths[other] for other in parts[-1]) + width > WIDTH - 2:
-            parts.append([])
-        parts[-1].append(index)
-    result = []
-    for position, part in enumerate(parts):
-        part_table = rich.table.Table(
-            title=escape(table.title) if position == 0 else None,
-            title_justify="left",
-            title_style="bold",
-            box=box.SIMPLE_HEAD,
-            pad_edge=False,
-            padding=(0, 1, 0, 0),
+    notes = dict.fromkeys(table.note for table in tables)
+    return [
+        TerminalTable(
+            table.title,
+            (*table.heads, *table.columns),
+            tuple(TerminalRow((*row.head, *(matrix_text(cell, table) for cell in row.cells))) for row in table.rows),
+            head_count=1,
+            note="\n".join(notes) if table is tables[-1] else "",
         )
-        part_table.add_column(escape(table.heads[0]), width=head_width, justify="right")
-        for index in part:
-            part_table.add_column(escape(table.columns[index]), justify="right", no_wrap=True)
-        for row, row_texts in zip(table.rows, texts, strict=True):
-            part_table.add_row(escape(row.head[0]), *(_coloured(row.cells[i], row_texts[i]) for i in part))
-        result.append(part_table)
-    return result
-
-
-def _coloured(cell: TableCell, text: str) -> str:
-    if math.isnan(cell.mean):
-        return ""
-    return f"[red]{escape(text)}[/red]" if cell.mean > 0.0 else escape(text)
+        for table in tables
+    ]
 
 
 def matrix_text(cell: TableCell, table: Table) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError
-from ssad.core.safeio import parse_yaml_document
+from ssad.core.safeio import dump_json, parse_yaml_document
+from ssad.core.seeding import digest
 from ssad.core.types import Scenario
 from ssad.scenarios.dynamic import (
     build_episode,
+    load_scenarios,
     read_scenarios,
     sample_parameters,
     sampling_ranges,
@@ -226,3 +229,10 @@ def test_grids(entry: Any, values: tuple[float, ...]) -> None:
 def test_broken_grids_are_refused(entry: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         grid_values(entry)
+
+
+def test_fields_that_came_later_change_no_seed() -> None:
+    """The hash is that of SSAD before scenarios had parameters of their own: seeds of cells follow from it."""
+    (old,) = load_scenarios("StraightObstacle/00")
+    assert digest(dump_json(scenario_json(old)))[:12] == "9e58a6134e6e"
+    assert "friction" in scenario_json(dataclasses.replace(old, friction=0.5))
