@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssad.core.errors import RouteError
+from ssad.core.errors import ConfigError, RouteError
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import TURN, LaneGraph
 from ssad.core.rotations import wrap_scalar
@@ -59,24 +59,31 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
         RouteError: The town does not allow the scenario, or none of the draws has room for its actors.
     """
     check(scenario)
-    try:
-        route = _route(graph, scenario.route)
-    except RouteError as error:
-        raise RouteError(f"scenario {scenario.name}: {error}") from None
+    route = _scenario_route(scenario, graph)
     if spread == 0.0:
         return _build_one(scenario, graph, route, seed)
-    problem = None
+    problem: ConfigError | RouteError | None = None
     for attempt in range(_ATTEMPTS):
         random = generator("scenario", scenario.name, scenario.seed, seed, "spread", attempt)
+        drawn_scenario = sample_parameters(scenario, random, spread=spread)
         try:
-            return _build_one(
-                sample_parameters(scenario, random, spread=spread), graph, route, seed, require_clearance=True
-            )
-        except RouteError as error:
+            if scenario.expressions:  # a drawn parameter may give a key an impossible value, and the route another way
+                check(drawn_scenario)
+                route = _scenario_route(drawn_scenario, graph)
+            return _build_one(drawn_scenario, graph, route, seed, require_clearance=True)
+        except (ConfigError, RouteError) as error:
             problem = error
     raise RouteError(
         f"{problem} (the last of {_ATTEMPTS} draws with seed {seed} and spread {spread:g}; a smaller spread may do)"
     )
+
+
+def _scenario_route(scenario: Scenario, graph: LaneGraph) -> Route:
+    """Return the ego's route. RouteError, with the name of the scenario, if the town does not allow it."""
+    try:
+        return _route(graph, scenario.route)
+    except RouteError as error:
+        raise RouteError(f"scenario {scenario.name}: {error}") from None
 
 
 def _build_one(
@@ -107,7 +114,9 @@ def _build_one(
         )
     agents = (ego, *other_agents)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
-    check_all = require_clearance and any(parameter.spread for parameter in scenario_kind.parameters)
+    is_varied = any(parameter.spread for parameter in scenario_kind.parameters)
+    is_varied |= any(declaration.spread for declaration in scenario.declared.values())
+    check_all = require_clearance and is_varied
     _check_start(scenario, agents, movable=len(agents) if check_all else 1)
     return Episode(
         key=f"{scenario.name}@{digest(dump_json(scenario_data(scenario)), seed)[:12]}",
