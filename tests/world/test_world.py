@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, EpisodeLimits, Phase, PhaseTrigger, Pose
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_simulator
-from ssad.world.kernels.traffic import LONGEST
+from ssad.world.episode_arrays import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
 from ssad.world.world import World
@@ -354,8 +354,8 @@ def test_follower_keeps_its_route_without_wobble() -> None:
     assert np.abs(np.diff(steer, n=2)).max() < 0.12
 
 
-def test_no_model_is_longer_than_the_autopilot_reckons_with() -> None:
-    assert max(m.length for m in MODELS.values()) / 2 <= float(LONGEST)
+def test_no_model_is_longer_than_every_episode_reckons_with() -> None:
+    assert max(m.length for m in MODELS.values()) / 2 <= LONGEST
 
 
 def test_where_turns_on_red_are_forbidden_the_autopilot_waits_and_a_turn_counts_as_run() -> None:

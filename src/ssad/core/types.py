@@ -135,6 +135,36 @@ class Model:
     max_accel: float = 0.0
     max_brake: float = 0.0
     max_speed: float = 0.0
+    brake_build_up: float = 0.0  # s from the demand until the brakes reach it, in a linear rise
+
+
+@dataclass(frozen=True)
+class Body:
+    """Dimensions and limits of one agent, in place of those of its model; None: as the model has it.
+
+    Attributes:
+        length: m, bumper to bumper.
+        width: m.
+        height: m.
+        wheelbase: m; the axles lie half of it before and behind the middle of the body. None: the model's share of
+            the length.
+        max_accel: Maximum acceleration, m/s^2.
+        max_brake: Maximum deceleration, m/s^2; the surface may allow less (`Scenario.friction`).
+        max_speed: m/s.
+        brake_build_up: Time in which the deceleration rises linearly from 0 to the demanded one, s.
+    """
+
+    length: float | None = None
+    width: float | None = None
+    height: float | None = None
+    wheelbase: float | None = None
+    max_accel: float | None = None
+    max_brake: float | None = None
+    max_speed: float | None = None
+    brake_build_up: float | None = None
+
+
+DEFAULT_FRICTION = 0.9  # of a dry road
 
 
 @dataclass(frozen=True)
@@ -181,6 +211,8 @@ class Actor:
 
     With `policy`, the name of a driver, that driver controls it; `path` is then its destination (key points along
     lanes; a walker's own line), at `target_speed` m/s on a free road.
+
+    `body` states dimensions and limits that differ from those of the model.
     """
 
     name: str
@@ -191,6 +223,7 @@ class Actor:
     trajectory: tuple[tuple[float, float, float, float], ...] = ()
     policy: str = ""
     target_speed: float = 8.0
+    body: Body = Body()
 
 
 @dataclass(frozen=True)
@@ -256,6 +289,10 @@ class Scenario:
         seed: Seed of its random parts.
         group: Group that it belongs to in a set.
         source: Origin of the scenario.
+        ego_model: Name of the ego's model.
+        ego_body: Dimensions and limits of the ego that differ from those of its model.
+        friction: Coefficient of friction of the surface. Accelerations stay below friction * g, and the lateral grip
+            of vehicles is proportional to it.
     """
 
     name: str
@@ -273,6 +310,9 @@ class Scenario:
     seed: int = 0
     group: str = ""
     source: str = ""
+    ego_model: str = "car"
+    ego_body: Body = Body()
+    friction: float = DEFAULT_FRICTION
 
 
 @dataclass(frozen=True)
@@ -312,6 +352,7 @@ class EpisodeAgent:
         wake_distance: Distance of the ego at which it wakes, m; 0: it is awake from the start.
         trajectory: See `Actor`.
         policy: See `Actor`.
+        body: Dimensions and limits that differ from those of the model.
     """
 
     name: str
@@ -325,6 +366,7 @@ class EpisodeAgent:
     wake_distance: float = 0.0
     trajectory: tuple[tuple[float, float, float, float], ...] = ()
     policy: str = ""
+    body: Body = Body()
 
 
 @dataclass(frozen=True)
@@ -342,6 +384,7 @@ class Episode:
         override_until: s.
         limits: End conditions of the episode.
         seed: Seed of its random parts.
+        friction: Coefficient of friction of the surface.
     """
 
     key: str
@@ -352,6 +395,7 @@ class Episode:
     override_until: float = 60.0
     limits: EpisodeLimits = field(default_factory=EpisodeLimits)
     seed: int = 0
+    friction: float = DEFAULT_FRICTION
 
 
 @dataclass(frozen=True)
@@ -389,6 +433,7 @@ class EpisodeTrace:
         signal: Their states [T, S'].
         route: The ego's route [N, 2], m.
         end: Reason of the end (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
+        heights: Heights of the agents, m; empty where all agents have the dimensions of their models.
     """
 
     key: str
@@ -421,3 +466,4 @@ class EpisodeTrace:
     signal: U8
     route: F32
     end: str
+    heights: tuple[float, ...] = ()

@@ -14,7 +14,7 @@ from ssad.drivers.careful.encounter import Encounter
 from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, initial_reaction, react
 from ssad.drivers.careful.sight import Path, encounters
 from ssad.drivers.careful.steering import pursue
-from ssad.world.models import model
+from ssad.world.models import agent_model
 
 STEP = 0.1  # s, of the world
 REACH = 100.0  # m that it sees
@@ -64,7 +64,7 @@ class Careful:
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget all agents and prepare for new episodes."""
-        bodies = [model(episode.agents[0].model) for episode in episodes]
+        bodies = [agent_model(episode.agents[0]) for episode in episodes]
         self._half = np.array([(0.5 * body.length, 0.5 * body.width) for body in bodies]).reshape(-1, 2)
         self._power = np.array([(body.max_accel, body.max_brake) for body in bodies]).reshape(-1, 2)
         self._wheel = np.array([(body.wheelbase, body.max_steer) for body in bodies]).reshape(-1, 2)

@@ -31,9 +31,8 @@ from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import move_pose
 from ssad.scenarios.dynamic.sampling import sample_parameters
 from ssad.scenarios.dynamic.schema import check, scenario_data
-from ssad.world.models import model
+from ssad.world.models import agent_model
 
-EGO_MODEL = "car"
 _ATTEMPTS = 8  # draws before a spread is reported as impossible
 _FORCED = {"off": SignalState.OFF, "red": SignalState.RED, "green": SignalState.GREEN}
 
@@ -89,7 +88,8 @@ def _build_one(
     values = scenario_kind.values(scenario.parameters)
     ego = EpisodeAgent(
         name="ego",
-        model=EGO_MODEL,
+        model=scenario.ego_model,
+        body=scenario.ego_body,
         controller=Controller.EXTERNAL,
         pose=_pose_beside_route(route, values["ego_longitudinal"], values["ego_lateral"], values["ego_heading"]),
         speed=values["ego_speed"],
@@ -118,6 +118,7 @@ def _build_one(
         override_until=scenario.signals.until,
         limits=scenario.limits,
         seed=seed,
+        friction=scenario.friction,
     )
 
 
@@ -229,7 +230,7 @@ def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent], *, movable:
         if not agent.trajectory or agent.trajectory[0][0] <= 0.0 <= agent.trajectory[-1][0]
     ]
     for agent in present:
-        body = model(agent.model)
+        body = agent_model(agent)
         footprints.append((agent.pose.x, agent.pose.y, agent.pose.yaw, body.length, body.width))
     for index, footprint in enumerate(footprints[:movable]):
         for other_index, other_footprint in enumerate(footprints[index + 1 :], index + 1):

@@ -13,17 +13,39 @@ import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.safeio import Document, Location, format_location
-from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Scenario, SignalPlan, TrafficPlan
+from ssad.core.types import (
+    Actor,
+    AgentKind,
+    Body,
+    EpisodeLimits,
+    Phase,
+    PhaseTrigger,
+    Pose,
+    Scenario,
+    SignalPlan,
+    TrafficPlan,
+)
 from ssad.scenarios.dynamic.catalogue import CUSTOM, scenario_type
-from ssad.world.models import model
+from ssad.world.models import model, model_with_body
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
-_DATA = (Scenario, Pose, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits)
+_DATA = (Scenario, Pose, Body, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits)
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
+_BODY_LIMITS = {
+    "length": (0.1, 30.0, "m"),
+    "width": (0.1, 5.0, "m"),
+    "height": (0.1, 6.0, "m"),
+    "wheelbase": (0.1, 25.0, "m"),
+    "max_accel": (0.1, 30.0, "m/s^2"),
+    "max_brake": (0.1, 30.0, "m/s^2"),
+    "max_speed": (0.1, 100.0, "m/s"),
+    "brake_build_up": (0.0, 5.0, "s"),
+}
+_FRICTION = 0.05, 1.5
 _MAX_COORDINATE = 1.0e5
 _MAX_STEPS = 100_000
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
@@ -116,6 +138,8 @@ def _fields_at(location: Location) -> list[str]:
         "signals": SignalPlan,
         "traffic": TrafficPlan,
         "limits": EpisodeLimits,
+        "body": Body,
+        "ego_body": Body,
     }
     for part in location:
         dataclass_type = type_of_key.get(str(part), dataclass_type) if isinstance(part, str) else dataclass_type
@@ -147,6 +171,7 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         yield ("target_speed",), f"{scenario.target_speed:g} is outside 0 to {MAX_SPEED:g} m/s"
     if scenario.seed < 0:
         yield ("seed",), "must not be negative"
+    yield from _ego(scenario)
     yield from _plans(scenario)
     if scenario.type == CUSTOM:
         yield from _actors(scenario)
@@ -162,6 +187,27 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
             yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box)}"
         elif problem := box[name].problem(value):
             yield ("parameters", name), problem
+
+
+def _ego(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    try:
+        ego = model(scenario.ego_model)
+    except ConfigError as error:
+        yield ("ego_model",), str(error)
+    else:
+        if ego.kind in (AgentKind.WALKER, AgentKind.PROP):
+            yield ("ego_model",), f"{scenario.ego_model} is no vehicle, which the ego must be"
+    yield from _body(scenario.ego_body, ("ego_body",))
+    low, high = _FRICTION
+    if not low <= scenario.friction <= high:
+        yield ("friction",), f"{scenario.friction:g} is outside {low:g} to {high:g}"
+
+
+def _body(body: Body, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    for key, (low, high, unit) in _BODY_LIMITS.items():
+        value = getattr(body, key)
+        if value is not None and not low <= value <= high:
+            yield (*place, key), f"{value:g} is outside {low:g} to {high:g} {unit}"
 
 
 def _poses(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -206,10 +252,13 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
     for actor_index, actor in enumerate(scenario.actors):
         location = ("actors", actor_index)
         try:
-            max_speed = model(actor.model).max_speed
+            max_speed = model_with_body(model(actor.model), actor.body).max_speed
         except ConfigError as error:
             yield (*location, "model"), str(error)
             continue
+        yield from _body(actor.body, (*location, "body"))
+        if actor.body.max_speed is not None and model(actor.model).max_speed == 0.0:
+            yield (*location, "body", "max_speed"), f"a {actor.model} does not move"
         if not _finite(actor.pose):
             yield (*location, "pose"), f"beyond {_MAX_COORDINATE:g} m or not a number"
         if len(actor.path) == 1:

@@ -79,7 +79,9 @@ class EpisodeArrays:
     contact: wp.array(dtype=wp.int32)  # [E] ContactPolicy
     kind: wp.array(dtype=wp.int32)  # [models] AgentKind
     body: wp.array(dtype=wp.vec4)  # [models] half length, half width, wheelbase, max steer
-    power: wp.array(dtype=wp.vec4)  # [models] max accel, max brake, max speed, unused
+    power: wp.array(dtype=wp.vec4)  # [models] max accel, max brake, max speed, s until the brakes have built up
+    # [E] m/s^2 that the surface allows along the heading and across it, half length of the longest body m
+    surface: wp.array(dtype=wp.vec3)
 
 
 @wp.struct
@@ -123,6 +125,7 @@ class State:
     speed: wp.array2d(dtype=wp.float32)  # [B, A]
     accel: wp.array2d(dtype=wp.float32)  # [B, A] m/s^2 along the heading
     wheel: wp.array2d(dtype=wp.float32)  # [B, A] front-wheel angle, rad
+    braking: wp.array2d(dtype=wp.float32)  # [B, A] brake that has built up, 0 to 1
     active: wp.array2d(dtype=wp.int32)  # [B, A] Presence
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun

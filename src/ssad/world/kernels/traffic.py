@@ -48,7 +48,6 @@ NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
-LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
 
 @wp.func
@@ -446,8 +445,8 @@ def scan_agents(
         frame = way_frame(roads, route[0], route[1], shift, float(at) + offset + 0.2 * float(corner + 1) * view_range)
         box_low = wp.vec2(wp.min(box_low[0], frame[0]), wp.min(box_low[1], frame[1]))
         box_high = wp.vec2(wp.max(box_high[0], frame[0]), wp.max(box_high[1], frame[1]))
-    # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
-    padding = own_body[0] + LONGEST + 4.0
+    # room for both bodies, and 2 m each that bends leave the chords between the five places
+    padding = own_body[0] + bank.surface[e][2] + 4.0
     if is_changing_lane(shift):
         padding = padding + ASIDE
     box_low = wp.vec2(box_low[0] - padding, box_low[1] - padding)

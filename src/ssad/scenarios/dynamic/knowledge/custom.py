@@ -34,6 +34,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
                 target_speed=max((phase.speed for phase in actor.phases), default=0.0),
                 phases=actor.phases,
                 route=polyline_route(np.asarray(actor.path, dtype=np.float64)) if actor.path else None,
+                body=actor.body,
             )
         )
     return agents
@@ -57,6 +58,7 @@ def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
         target_speed=actor.target_speed,
         route=route,
         policy=actor.policy,
+        body=actor.body,
     )
 
 
@@ -71,7 +73,13 @@ def _recorded(actor: Actor) -> EpisodeAgent:
     pose = Pose(x + fraction * (x1 - x), y + fraction * (y1 - y), heading)
     speed = ((x1 - x) * np.cos(heading) + (y1 - y) * np.sin(heading)) / (t1 - t)
     return EpisodeAgent(
-        actor.name, actor.model, Controller.TRAJECTORY, pose, speed=float(speed), trajectory=actor.trajectory
+        actor.name,
+        actor.model,
+        Controller.TRAJECTORY,
+        pose,
+        speed=float(speed),
+        trajectory=actor.trajectory,
+        body=actor.body,
     )
 
 
