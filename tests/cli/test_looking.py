@@ -196,6 +196,35 @@ def test_show_takes_photographs_upright_and_whole(photographs: Path, tmp_path: P
     assert "--scenes is for a nuScenes folder" in ssad("show", photographs, tmp_path / "x", "--scenes", "a").stderr
 
 
+@pytest.mark.data
+def test_real_photographs_pass_through_every_command_upright_and_whole(mine: Path, data_dir: Path) -> None:
+    source = data_dir / "real"
+    if not source.is_dir():
+        pytest.skip("SSAD_DATA has no photographs (real/)")
+    originals = {path.stem: read_image(path) for path in sorted(source.iterdir()) if path.suffix in (".jpg", ".png")}
+    assert len(originals) == 8
+    detected = ssad("detect", source, "found", "--detector", f"{mine.name}:Finder", "--device", "cpu")
+    assert detected.stdout.count(": 1 boxes\n") == 8
+    shifted = ssad("shift", source, "shifted", "--shifts", "overexposure", "--severity", "1", "--workers", "1")
+    assert "8 pictures shifted, 3 other files linked unchanged" in shifted.stdout
+    assert "(8 of 8 pictures" in ssad("show", source, "page").stdout
+    page = re.findall(r'src="([^"]+)".*?<figcaption>(\w+)\.', Path("page/index.html").read_text())
+    shown = {stem: Path("page") / name for name, stem in page}
+    for stem, original in originals.items():
+        expected = _thumbnail(original)
+        for path in (Path(f"found/{stem}.jpg"), next(Path("shifted/overexposure-1").glob(f"{stem}.*")), shown[stem]):
+            image = read_image(path)
+            if path != shown[stem]:  # a page has smaller copies
+                assert image.shape == original.shape, path
+            thumbnail = _thumbnail(image)
+            assert np.corrcoef(expected, thumbnail)[0, 1] > 0.97, path
+            assert np.corrcoef(expected, thumbnail[::-1])[0, 1] < 0.9, f"{path} would pass upside down"
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    return np.asarray(Image.fromarray(image).convert("L").resize((32, 18), Image.Resampling.BOX), float).ravel()
+
+
 class Ahead:
     """Finds a parked car 10 m in front of each camera."""
 

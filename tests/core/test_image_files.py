@@ -159,6 +159,26 @@ def test_a_turned_png_of_sixteen_bits_is_turned_once() -> None:
         assert np.array_equal(again.rgb, image_file.rgb), kind
 
 
+def test_tiff_with_channels_in_planes_is_read_or_refused() -> None:
+    def tiff(image: Any) -> bytes:
+        """A TIFF that holds red, then green, then blue."""
+        height, width, _ = image.shape
+        planes = [image[..., channel].tobytes() for channel in range(3)]
+        bits, size = 8 * image.itemsize, len(planes[0])
+        table = 8 + 3 * size
+        directory = table + 8 + 24
+        tags = [(256, 3, 1, width), (257, 3, 1, height), (258, 3, 3, table), (259, 3, 1, 1), (262, 3, 1, 2)]
+        tags += [(273, 4, 3, table + 8), (277, 3, 1, 3), (278, 3, 1, height), (279, 4, 3, table + 20), (284, 3, 1, 2)]
+        values = struct.pack("<4H6I", bits, bits, bits, 0, 8, 8 + size, 8 + 2 * size, size, size, size)
+        rows = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+        header = struct.pack("<2sHI", b"II", 42, directory)
+        return header + b"".join(planes) + values + struct.pack("<H", len(tags)) + rows + bytes(4)
+
+    assert np.array_equal(decode_image_file(tiff(street())).rgb, street())
+    with pytest.raises(FormatError, match=r"^a\.tif: 16 bits a channel in separate planes"):
+        decode_image_file(tiff(deep(channels=3)), "a.tif")
+
+
 def test_values_of_a_pnm_are_shares_of_its_maximum() -> None:
     for header, count in ((b"P5\n3 1\n1023\n", 1), (b"P6\n1 1\n1023\n", 3)):
         image_file = decode_image_file(header + np.array([0, 512, 1023], ">u2").tobytes())

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from ssad.cli import paths
-from ssad.cli.importing import check_yaml, store_town
+from ssad.cli.importing import Strict, check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
 
@@ -64,7 +64,7 @@ def import_map(
         Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
     ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Refuse a file with anything doubtful.")] = False,
+    strict: Strict = False,
     turn_on_red: Annotated[
         bool | None,
         typer.Option(
@@ -97,9 +97,7 @@ def import_map(
         turn_on_red=turn_on_red,
         progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
     )
-    print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
-    for line in report.lines():
-        print(line)
+    print(report.text(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}"))
     print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 
 

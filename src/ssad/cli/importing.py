@@ -15,7 +15,10 @@ from ssad.cli import paths
 from ssad.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from ssad.core.import_report import ImportReport
     from ssad.core.lane_graph import LaneGraph
+
+Strict = Annotated[bool, typer.Option("--strict", help="Refuse a file with anything doubtful.")]
 
 
 class Format(StrEnum):
@@ -194,6 +197,22 @@ def check_yaml(out: Path) -> None:
     """Raise ConfigError if a scenario file does not end in .yaml."""
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a scenario file ends in .yaml")
+
+
+def show_report(report: ImportReport, first_line: str, out: Path) -> None:
+    """Print the report of an import, and write it beside the result, there with every place that it names.
+
+    Args:
+        report: The report. Its doubts are refused earlier, before anything is written.
+        first_line: Name and place of the result.
+        out: The result, such as a scenario file.
+    """
+    from ssad.core.import_report import report_path
+    from ssad.core.safeio import write_atomic
+
+    print(report.text(first_line))
+    write_atomic(report_path(out), f"{report.text(f'import of {report.source}', examples=None)}\n")
+    print(f"this report is in {report_path(out)}")
 
 
 def store_town(graph: LaneGraph, town: str, *, beside: Path) -> None:

@@ -57,6 +57,8 @@ _OTHER_SUFFIXES: Final = (
     *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"),
 )
 _ORIENTATION: Final = 0x0112  # EXIF tag
+_BITS_PER_SAMPLE: Final = 0x0102  # TIFF tag
+_PLANAR: Final = 0x011C  # TIFF tag: 2 where each channel is stored by itself
 _JPEG: Final = b"\xff\xd8\xff"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_BLOCKS: Final = len(_PNG) + 25  # offset behind the header block of a PNG
@@ -151,6 +153,9 @@ def decode_image_file(data: bytes, name: str = "<image>") -> ImageFile:
             pixels = turn_upright(stored, orientation)
             return ImageFile(pixels, None, file_format, orientation, model, lossless, frames, name)
         has_16_bits = _has_16_bits(image_file, data)
+        if has_16_bits and file_format == "TIFF" and image_file.tag_v2.get(_PLANAR, 1) == 2:
+            # OpenCV reads the planes as if their channels were interleaved.
+            raise FormatError(f"{name}: 16 bits a channel in separate planes are not supported; save it as PNG")
         if not has_16_bits:
             image_file.load()
             # Pillow turns a TIFF when it loads it.
@@ -215,8 +220,7 @@ def _has_16_bits(image_file: Any, data: bytes) -> bool:
         return data[24] == 16  # bit depth in the header block
     if image_file.format == "PPM":
         return _pnm_maximum(data) > 255
-    bits_per_sample = 258
-    return image_file.format == "TIFF" and bool(image_file.tag_v2.get(bits_per_sample, (8,))[0] == 16)
+    return image_file.format == "TIFF" and bool(image_file.tag_v2.get(_BITS_PER_SAMPLE, (8,))[0] == 16)
 
 
 def _pnm_maximum(data: bytes) -> int:

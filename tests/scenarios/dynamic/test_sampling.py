@@ -399,6 +399,12 @@ def test_answers_are_kept_by_map_and_route(crossroads: LaneGraph, routes: Any) -
         ask(crossroads, routes.left, number=1)
 
 
+@pytest.mark.parametrize("length", [0.5, 100_001.0, 1e300])
+def test_a_path_of_an_actor_has_a_plausible_length(length: float) -> None:
+    with pytest.raises(RouteError, match=r"too short|too long"):
+        polyline_route(np.array([[0.0, 0.0], [length, 0.0]]))
+
+
 def test_the_trigger_is_found_on_the_route_that_is_asked_about() -> None:
     east = polyline_route(np.array([[0.0, 0.0], [50.0, 0.0]]))
     later = polyline_route(np.array([[10.0, 0.0], [50.0, 0.0]]))
