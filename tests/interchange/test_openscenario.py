@@ -312,7 +312,7 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
     gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
     moving, speed = int(np.flatnonzero(trace.speed[:, 1] > 0.0)[0]), trace.speed[:, 1]
     assert moving - 1 - int(np.flatnonzero(gap < 15.0)[0]) == 20
-    assert int(np.flatnonzero(np.diff(speed) > 0.1)[-1]) + 1 == moving - 1 + 35  # from then on it brakes
+    assert int(np.flatnonzero(np.diff(speed) < -0.1)[0]) == moving - 1 + 35  # from then on it brakes
 
     path.write_text(text.replace('storyboardElementRef="go"', 'storyboardElementRef="a"'))
     found = read_openscenario(path)

@@ -342,7 +342,7 @@ class _Reader:
     def _lane_change(self, entity: Entity, action: Element, start_condition: PhaseTrigger | None, label: str) -> None:
         """A lane change whose place is known becomes part of the path; else it is lost."""
         target = action.find("LaneChangeAction/LaneChangeTarget/RelativeTargetLane")
-        speed = entity.phases[-1].speed if entity.phases else entity.speed
+        speed = (entity.phases[-1].speed or 0.0) if entity.phases else entity.speed
         start_distance = (
             {"always": 0.0, "travelled": start_condition.value, "time": start_condition.value * speed}.get(
                 start_condition.kind

@@ -283,13 +283,14 @@ class _Writer:
         agent_model = model(agent.model)
         speed, previous_event = agent.speed, ""
         for phase_index, phase in enumerate(agent.phases):
+            target_speed = phase.speed or 0.0
             event = self._event(maneuver, f"{name} phase {phase_index}", "override")
             action = _node(_node(event, "Action", name=f"{name} speed {phase_index}"), "PrivateAction")
             if agent_model.kind == AgentKind.WALKER:
-                _write_speed(action, phase.speed, "step", "time", 0.0)
+                _write_speed(action, target_speed, "step", "time", 0.0)
             else:
-                acceleration = agent_model.max_accel if phase.speed >= speed else agent_model.max_brake
-                _write_speed(action, phase.speed, "linear", "rate", acceleration)
+                acceleration = agent_model.max_accel if target_speed >= speed else agent_model.max_brake
+                _write_speed(action, target_speed, "linear", "rate", acceleration)
             trigger = _node(event, "StartTrigger")
             # phases are latched, one after another: an event waits until the previous one runs or is complete
             for state in ("runningState", "completeState") if previous_event else ("",):
@@ -311,7 +312,7 @@ class _Writer:
                         storyboardElementRef=previous_event,
                         state=state,
                     )
-            speed, previous_event = phase.speed, f"{name} phase {phase_index}"
+            speed, previous_event = target_speed, f"{name} phase {phase_index}"
 
     def _event(self, maneuver: Element, name: str, priority: str) -> Element:
         return _node(maneuver, "Event", name=name, priority=priority, maximumExecutionCount=1)

@@ -79,7 +79,11 @@ NOMINAL = {
 
 
 # fields that came later: at their defaults they change nothing
-LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None}
+LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None, "lateral": (), "lateral_targets": ()}
+LATER |= {"acceleration": None, "jerk": None, "shape": "linear", "duration": None, "distance": None, "arrival": None}
+LATER |= {"name": "", "reference": "", "factor": False, "continuous": False, "anytime": False, "agent": "", "phase": ""}
+LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_space": False, "measure": "straight"}
+LATER |= {"all": (), "any": ()}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

@@ -16,8 +16,10 @@ from ssad.core.safeio import Document, Location, format_location
 from ssad.core.types import (
     Actor,
     AgentKind,
+    Arrival,
     Body,
     EpisodeLimits,
+    LateralPhase,
     Phase,
     PhaseTrigger,
     Pose,
@@ -26,12 +28,25 @@ from ssad.core.types import (
     TrafficPlan,
 )
 from ssad.scenarios.dynamic.catalogue import CUSTOM, scenario_type
+from ssad.scenarios.dynamic.phases import phase_problems
 from ssad.world.models import model, model_with_body
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
-_DATA = (Scenario, Pose, Body, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits)
+_DATA = (
+    Scenario,
+    Pose,
+    Body,
+    Actor,
+    Phase,
+    LateralPhase,
+    Arrival,
+    PhaseTrigger,
+    SignalPlan,
+    TrafficPlan,
+    EpisodeLimits,
+)
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
@@ -134,6 +149,8 @@ def _fields_at(location: Location) -> list[str]:
         "pose": Pose,
         "actors": Actor,
         "phases": Phase,
+        "lateral": LateralPhase,
+        "arrival": Arrival,
         "when": PhaseTrigger,
         "signals": SignalPlan,
         "traffic": TrafficPlan,
@@ -249,6 +266,7 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 
 def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    max_speeds: dict[int, float] = {}
     for actor_index, actor in enumerate(scenario.actors):
         location = ("actors", actor_index)
         try:
@@ -265,14 +283,8 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
             yield (*location, "path"), "a path needs at least two points"
         yield from _trajectory(actor, location)
         yield from _policy(actor, location, max_speed)
-        for phase_index, phase in enumerate(actor.phases):
-            phase_location = (*location, "phases", phase_index)
-            if not 0.0 <= phase.speed <= max_speed:
-                yield (*phase_location, "speed"), f"{phase.speed:g} is outside 0 to {max_speed:g} m/s ({actor.model})"
-            if not 0 <= phase.when.actor < len(scenario.actors):
-                yield (*phase_location, "when", "actor"), f"there are actors 0 to {len(scenario.actors) - 1}"
-            if phase.when.value < 0.0:
-                yield (*phase_location, "when", "value"), "must not be negative"
+        max_speeds[actor_index] = max_speed
+    yield from phase_problems(scenario.actors, max_speeds)
 
 
 def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:

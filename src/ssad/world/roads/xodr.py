@@ -521,11 +521,11 @@ class _Reader:
             )
         elif shape.tag == "paramPoly3":
             kind = CURVE
-            range_name = shape.get("pRange", "normalized")
-            if range_name not in ("arcLength", "normalized"):
+            range_name = shape.get("pRange", "normalized").strip().lower()
+            if range_name not in ("arclength", "normalized"):
                 self.report.doubt("pRange is neither arcLength nor normalized; normalized is taken", location)
             coefficients = [f"{letter}{axis}" for axis in "UV" for letter in "abcd"]
-            end = length if range_name == "arcLength" else 1.0
+            end = length if range_name == "arclength" else 1.0
             numbers = [self.number(shape, name, location, limit=MAX_COEFFICIENT) for name in coefficients]
             values = (*numbers, max(end, 1e-9))
         if kind == CLOTHOID and max(map(abs, values)) * length > MAX_TURN:
@@ -570,6 +570,8 @@ class _Reader:
             if is_missing:
                 self.report.doubt("a road is linked to a junction that the map lacks; it ends there", f"road {road.id}")
             links.append(None if is_missing else link)
+        if road.junction >= 0 and road.junction not in junctions:
+            self.report.doubt("a road belongs to a junction that the map lacks", f"road {road.id}")
         return replace(road, predecessor=links[0], successor=links[1])
 
     def connections(self, junction: Element, location: str) -> Iterator[Connection]:
@@ -843,12 +845,15 @@ def local_coordinates(xodr: bytes) -> bytes:
 
 
 def _without_namespace(root: Element) -> Element:
-    """Return a tree with the namespace of its root removed from its tags."""
-    namespace, brace, _ = root.tag.rpartition("}")
-    if brace:
+    """Return a tree with the namespaces of its root and of its roads and junctions removed from its tags."""
+    tags = [element.tag for element in (root, *root) if isinstance(element.tag, str)]
+    names = ("OpenDRIVE", "header", "road", "junction", "controller")
+    prefixes = {tag.removesuffix(name) for tag in tags for name in names if tag.endswith(f"}}{name}")}
+    if prefixes:
         for element in root.iter():
             if isinstance(element.tag, str):
-                element.tag = element.tag.removeprefix(f"{namespace}}}")
+                namespace, brace, name = element.tag.rpartition("}")
+                element.tag = name if namespace + brace in prefixes else element.tag
     return root
 
 
