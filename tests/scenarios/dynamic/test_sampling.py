@@ -84,6 +84,7 @@ LATER |= {"acceleration": None, "jerk": None, "shape": "linear", "duration": Non
 LATER |= {"name": "", "reference": "", "factor": False, "continuous": False, "anytime": False, "agent": "", "phase": ""}
 LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_space": False, "measure": "straight"}
 LATER |= {"all": (), "any": ()}
+LATER |= {"declared": {}, "expressions": {}, "constraints": ()}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

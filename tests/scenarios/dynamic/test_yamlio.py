@@ -180,7 +180,11 @@ BAD: list[tuple[dict[str, Any], int, str]] = [
         'a valid string, not {"long": ["aaaaaaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbbbbbb",...',
     ),
     ({"route": "[{x: 0, y: 0}]"}, 4, "at least two key points"),
-    ({"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"}, 4, 'route[1].x: should be a valid number, not "nine"'),
+    (
+        {"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"},
+        4,
+        "route[1].x: expression 'nine': there is no parameter 'nine'; closest: ",
+    ),
     ({"route": "[{x: 0, y: 0}, {x: '9', y: 0}]"}, 4, "route[1].x: should be a valid number"),
     ({"route": "[{x: 0, y: 0}, {x: 9, y: 0, z: 1}]"}, 4, "route[1].z: unknown key; known: x, y, yaw"),
     ({"route": "[{x: 0, y: 0}, {x: 9}]"}, 4, "key 'y' is missing"),

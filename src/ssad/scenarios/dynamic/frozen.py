@@ -72,6 +72,9 @@ def freeze_episode(episode: Episode, trace: EpisodeTrace, *, name: str | None = 
         actors=tuple(actors),
         traffic=None,
         source=f"{base.name}, seed {episode.seed}",
+        declared={},
+        expressions={},
+        constraints=(),
     )
 
 
