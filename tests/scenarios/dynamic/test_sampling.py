@@ -84,7 +84,7 @@ LATER |= {"acceleration": None, "jerk": None, "shape": "linear", "duration": Non
 LATER |= {"name": "", "reference": "", "factor": False, "continuous": False, "anytime": False, "agent": "", "phase": ""}
 LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_space": False, "measure": "straight"}
 LATER |= {"all": (), "any": ()}
-LATER |= {"declared": {}, "expressions": {}, "constraints": ()}
+LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
 LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
