@@ -6,7 +6,7 @@ import re
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,9 @@ from ssad.cli import paths
 from ssad.cli.importing import Strict, check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ssad.world.roads.lanelet2 import Lanelet2Options
 
 
 def export_texture(
@@ -61,7 +64,10 @@ def export_light(
 
 def import_map(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="OpenDRIVE file (.xodr), Lanelet2 map (.osm), or a town as SSAD stores it (.npz)."
+        ),
     ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
     strict: Strict = False,
@@ -72,8 +78,26 @@ def import_map(
             help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON",
+            help="Lanelet2: latitude and longitude of the town's origin.  [default: middle of the map]",
+        ),
+    ] = None,
+    projection: Annotated[
+        str | None,
+        typer.Option(
+            metavar="utm|local",
+            help="Lanelet2: UTM, or transverse Mercator around the origin.  [default: local_x and local_y, else UTM]",
+        ),
+    ] = None,
+    left_hand: Annotated[
+        bool | None,
+        typer.Option("--left-hand/--right-hand", help="Lanelet2: side that traffic keeps to.  [default: by the map]"),
+    ] = None,
 ) -> None:
-    """Import an OpenDRIVE map (1.4 to 1.8) as a town; say what came in, what was left out, and what is doubtful.
+    """Import an OpenDRIVE map (1.4 to 1.8) or a Lanelet2 map as a town; say what is left out and what is doubtful.
 
     A page with this report and a picture from above is written too.
     """
@@ -96,9 +120,30 @@ def import_map(
         strict=strict,
         turn_on_red=turn_on_red,
         progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
+        lanelet2=_lanelet2_options(origin, projection, left_hand),
     )
     print(report.text(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}"))
     print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
+
+
+def _lanelet2_options(origin: str | None, projection: str | None, left_hand: bool | None) -> Lanelet2Options | None:
+    """Return the options of a Lanelet2 map; None if no option is given."""
+    from ssad.world.roads.lanelet2 import Lanelet2Options
+
+    if origin is None and projection is None and left_hand is None:
+        return None
+    if projection not in (None, "utm", "local"):
+        raise ConfigError(f"--projection {projection}: choose utm or local")
+    place = None
+    if origin is not None:
+        try:
+            latitude, longitude = (float(number) for number in origin.split(","))
+        except ValueError:
+            raise ConfigError(f"--origin {origin}: give latitude and longitude, such as 49.01,8.43") from None
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+            raise ConfigError(f"--origin {origin}: latitudes end at 90 degrees, longitudes at 180")
+        place = (latitude, longitude)
+    return Lanelet2Options(place, projection, left_hand)  # type: ignore[arg-type]
 
 
 def import_routes(

@@ -402,11 +402,20 @@ class Actor:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Behaviour of the signals of an episode: those that face the ego's route, and all the others."""
+    """Behaviour of the signals of an episode.
+
+    Attributes:
+        ego: State of the signals that face the ego's route.
+        others: State of all the others.
+        until: Time at which the signals return to their programs, s.
+        elsewhere: If the ego has red at one junction alone (`forced_signals`): the state of the signals that face it
+            at the other junctions of its route. Where these are green, the others there are red.
+    """
 
     ego: Literal["program", "off", "red", "green"] = "program"
     others: Literal["program", "off", "red", "green"] = "program"
     until: float = 60.0
+    elsewhere: Literal["program", "off", "red", "green"] = "program"
 
 
 @dataclass(frozen=True)

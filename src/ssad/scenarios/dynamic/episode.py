@@ -128,7 +128,9 @@ def _build_one(
         scenario=scenario,
         town=scenario.town,
         agents=agents,
-        signal_override=dict(_cached_forced_signals(graph, route, scenario.signals, scenario_kind.whole_town)),
+        signal_override=dict(
+            _cached_forced_signals(graph, route, scenario.signals, scenario.trigger, scenario_kind.whole_town)
+        ),
         override_until=scenario.signals.until,
         limits=scenario.limits,
         seed=seed,
@@ -175,14 +177,14 @@ def _fill_in_defaults(scenario: Scenario, kind: ScenarioType) -> Scenario:
 
 @cached_by_identity()
 def _cached_forced_signals(
-    graph: LaneGraph, route: Route, plan: SignalPlan, whole_town: bool
+    graph: LaneGraph, route: Route, plan: SignalPlan, trigger: Pose | None, whole_town: bool
 ) -> dict[int, SignalState]:
     """Return `forced_signals`, cached for a route."""
-    return forced_signals(graph, route, plan, whole_town=whole_town)
+    return forced_signals(graph, route, plan, trigger=trigger, whole_town=whole_town)
 
 
 def forced_signals(
-    graph: LaneGraph, route: Route, plan: SignalPlan, *, whole_town: bool = False
+    graph: LaneGraph, route: Route, plan: SignalPlan, *, trigger: Pose | None = None, whole_town: bool = False
 ) -> dict[int, SignalState]:
     """Return the states that a signal plan forces.
 
@@ -193,6 +195,8 @@ def forced_signals(
             the other signals of the junctions on the route. Where the ego is to have red, only the junctions count at
             which the route turns to the near side, which it may do on red; a route without such a turn has red
             everywhere.
+        trigger: The place that the scenario is built around. Of several turns to the near side, the ego has red at
+            the one that follows it.
         whole_town: Apply the state of other signals to the whole map.
 
     Returns:
@@ -209,15 +213,30 @@ def forced_signals(
         if (int(graph.road[lane]), int(graph.section[lane]), bool(graph.forward[lane])) in approach
     }
     junctions = {int(junction) for junction in np.unique(graph.junction[lanes]) if junction >= 0}
+    route_junctions = junctions
     if plan.ego == "red":
-        junctions = near_side_turns(graph, route) or junctions
+        junctions = _red_junctions(graph, route, trigger) or junctions
     forced_states: dict[int, SignalState] = {}
     for signal in range(len(graph.signal_junction)):
         on_route_junction = int(graph.signal_junction[signal]) in junctions
         state_name = plan.ego if signal in ego_signals and on_route_junction else plan.others
+        if not on_route_junction and int(graph.signal_junction[signal]) in route_junctions:
+            crossing_state = "red" if plan.elsewhere == "green" else plan.elsewhere
+            on_route_junction, state_name = True, plan.elsewhere if signal in ego_signals else crossing_state
         if state_name != "program" and (not graph.signal_virtual[signal] if whole_town else on_route_junction):
             forced_states[signal] = _FORCED[state_name]
     return forced_states
+
+
+def _red_junctions(graph: LaneGraph, route: Route, trigger: Pose | None) -> set[int]:
+    """Return the junctions at which the ego has red: its turns to the near side, or the next one of a trigger."""
+    turns = near_side_turns(graph, route)
+    if trigger is None or len(turns) < 2:
+        return turns
+    start = int(np.argmin(np.hypot(route.xy[:, 0] - trigger.x, route.xy[:, 1] - trigger.y)))
+    junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
+    following_turns = [int(number) for number in junction[start:] if int(number) in turns]
+    return {following_turns[0]} if following_turns else turns
 
 
 def near_side_turns(graph: LaneGraph, route: Route) -> set[int]:

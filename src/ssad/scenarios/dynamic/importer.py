@@ -24,7 +24,7 @@ import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import format_location, read_json, read_xml
-from ssad.core.types import EpisodeLimits, Pose, Scenario
+from ssad.core.types import EpisodeLimits, Pose, Scenario, SignalPlan
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE, PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
 from ssad.world.roads import load_town
@@ -61,6 +61,13 @@ _PARAMETERS: dict[int, tuple[str, ...]] = {
     **dict.fromkeys((5, 6, 7, 8), ("speed", "trigger_distance")),
 }
 """What the numbers of an entry mean in SafeBench's lists `human` and `random`, by scenario id."""
+# A red light outside the conflict would outlast SafeBench's 30 s: there the ego has green.
+_SIGNALS: dict[str, SignalPlan] = {
+    **dict.fromkeys(
+        ("StraightObstacle", "TurningObstacle", "LaneChanging", "VehiclePassing"), SignalPlan(ego="green", others="red")
+    ),
+    "RightTurn": replace(scenario_type("RightTurn").signals, elsewhere="green"),
+}
 _NEAR = 2.0  # m between a trigger and the route
 _FAR = 1e9  # m; the square of a longer way may be beyond a float
 _ALIGNED = math.radians(10.0)
@@ -295,6 +302,7 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
         route=route.points,
         trigger=event.trigger if event else None,
         placements=event.placements if event and kind in _PLACED else (),
+        signals=_SIGNALS.get(kind, SignalPlan()),
     )
     if kind in _PLACED and not scenario.placements:
         raise FormatError(f"{path}: its trigger names no other actor, which {kind} needs")

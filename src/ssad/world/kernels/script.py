@@ -682,6 +682,10 @@ def next_speed(
     v = state.speed[b, i]
     running = script.running[b, i][0]
     limits = wp.vec2(power[0], power[1])
+    if bank.kind[bank.model[e, i]] != AgentKind.WALKER:
+        limits = wp.vec2(wp.min(power[0], bank.surface[e][0]), wp.min(power[1], bank.surface[e][0]))
+    level = state.braking[b, i]
+    state.braking[b, i] = 0.0
     if running == 0:
         initial = bank.start[e, i][3]
         return v + wp.clamp(initial - v, -limits[1] * dt, limits[0] * dt)
@@ -711,6 +715,11 @@ def next_speed(
             acceleration = result[1]
             is_done = int(result[2])
         else:
+            if motion[1] == 0.0 and power[3] > 0.0 and target < v - ROUNDING:
+                # the brakes of the model build up
+                built_up = wp.min(level + dt / power[3], 1.0)
+                limits = wp.vec2(limits[0], wp.min(0.5 * (level + built_up) * power[1], limits[1]))
+                state.braking[b, i] = built_up
             speed = v + wp.clamp(target - v, -limits[1] * dt, limits[0] * dt)
             if wp.abs(speed - target) < ROUNDING:
                 speed = target
