@@ -340,6 +340,33 @@ class LateralPhase:
 
 
 @dataclass(frozen=True)
+class Impact:
+    """Place where an actor and the front of the ego would touch if nobody acted; it determines the actor's start.
+
+    The ego drives along its route at one speed, the actor straight ahead (along the route, if that is its heading) at
+    its start speed. An actor without a speed stands where the impact is.
+
+    Attributes:
+        distance: Way of the ego from its start to the impact, m.
+        location: Centre of the actor across the front of the ego, as a share of the ego's width: 0 is the ego's left
+            edge, 0.5 its centre line, 1 its right edge.
+        overlap: Share of the ego's width that the actor covers, in place of `location`; at 1, and where the actor is
+            too narrow, the centre lines coincide.
+        side: Side of the ego's centre line on which the centre of the actor is, with `overlap`.
+        heading: Heading of the actor relative to the route, rad: 0 the same direction, pi oncoming, pi / 2 from the
+            right to the left of the ego.
+        ego_speed: Speed of the ego, m/s; None: that at its start, or its target speed if it starts from a standstill.
+    """
+
+    distance: float
+    location: float = 0.5
+    overlap: float | None = None
+    side: Literal["left", "right"] = "left"
+    heading: float = 0.0
+    ego_speed: float | None = None
+
+
+@dataclass(frozen=True)
 class Actor:
     """A scripted participant of a scenario: pose in the world frame, phases, and an optional path to follow.
 
@@ -355,6 +382,8 @@ class Actor:
     lanes; a walker's own line), at `target_speed` m/s on a free road.
 
     `body` states dimensions and limits that differ from those of the model.
+
+    With `impact`, its pose and path follow from the place where it and the ego would collide; a file states neither.
     """
 
     name: str
@@ -368,15 +397,25 @@ class Actor:
     body: Body = Body()
     speed: float = 0.0
     lateral: tuple[LateralPhase, ...] = ()
+    impact: Impact | None = None
 
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Behaviour of the signals of an episode: those that face the ego's route, and all the others."""
+    """Behaviour of the signals of an episode.
+
+    Attributes:
+        ego: State of the signals that face the ego's route.
+        others: State of all the others.
+        until: Time at which the signals return to their programs, s.
+        elsewhere: If the ego has red at one junction alone (`forced_signals`): the state of the signals that face it
+            at the other junctions of its route. Where these are green, the others there are red.
+    """
 
     ego: Literal["program", "off", "red", "green"] = "program"
     others: Literal["program", "off", "red", "green"] = "program"
     until: float = 60.0
+    elsewhere: Literal["program", "off", "red", "green"] = "program"
 
 
 @dataclass(frozen=True)
@@ -413,8 +452,33 @@ class EpisodeLimits:
 
 
 @dataclass(frozen=True)
+class DeclaredParameter:
+    """Number that a scenario names, so that its keys can use it and sweeps, searches and repetitions vary it.
+
+    Attributes:
+        value: Value that it has if nothing varies it, or an expression of other parameters.
+        range: Minimum and maximum; searches cover it. None: no search varies the parameter.
+        spread: Maximum deviation of a repetition from the value at spread 1; None: that of the class's parameter of
+            this name, else 0.
+        unit: Unit of the values, "" for a plain number.
+        grid: Values of a sweep that takes the scenario's own grid.
+        doc: Meaning of the number.
+    """
+
+    value: float | str
+    range: tuple[float, float] | None = None
+    spread: float | None = None
+    unit: str = ""
+    grid: tuple[float, ...] = ()
+    doc: str = ""
+
+
+@dataclass(frozen=True)
 class Scenario:
     """A scenario as its author wrote it; round-trips through YAML.
+
+    Numbers that the author wrote as expressions have their values, and the expressions stand in `expressions`:
+    `ssad.scenarios.dynamic.with_parameters` evaluates them anew.
 
     Attributes:
         name: Name of the scenario.
@@ -433,6 +497,10 @@ class Scenario:
         seed: Seed of its random parts.
         group: Group that it belongs to in a set.
         source: Origin of the scenario.
+        declared: Parameters that the scenario declares itself; in YAML they stand among `parameters`.
+        expressions: Location of a number, such as `actors[0].phases[0].speed` -> its expression; in YAML it stands in
+            the place of the number.
+        constraints: Conditions on the parameters; sweeps, searches and repetitions leave out what violates one.
         ego_model: Name of the ego's model.
         ego_body: Dimensions and limits of the ego that differ from those of its model.
         friction: Coefficient of friction of the surface. Accelerations stay below friction * g, and the lateral grip
@@ -454,6 +522,9 @@ class Scenario:
     seed: int = 0
     group: str = ""
     source: str = ""
+    declared: Mapping[str, DeclaredParameter] = field(default_factory=dict)
+    expressions: Mapping[str, str] = field(default_factory=dict)
+    constraints: tuple[str, ...] = ()
     ego_model: str = "car"
     ego_body: Body = Body()
     friction: float = DEFAULT_FRICTION

@@ -60,6 +60,8 @@ def _actor_problems(actors: Sequence[Actor], index: int, max_speed: float) -> It
         yield ("speed",), "an actor with a trajectory has the speed of its rows"
     if actor.lateral and (actor.trajectory or actor.policy):
         yield ("lateral",), "an actor with a trajectory or a policy has no lateral phases"
+    elif actor.lateral and not max_speed > 0.0:
+        yield ("lateral",), f"nobody drives a {actor.model}"
     names = [phase.name for phase in all_phases(actor) if phase.name]
     for key in _LISTS:
         phases: Sequence[AnyPhase] = getattr(actor, key)
@@ -193,6 +195,10 @@ def _trigger_problems(trigger: PhaseTrigger, place: Place, actors: Sequence[Acto
     for key, name in (("agent", trigger.agent), ("reference", trigger.reference)):
         if name and name != actor.name:
             yield from _agent_problem(name, (*place, key), actors, "")
+    if trigger.actor and kind in (*PAIRS, *PHASE_KINDS, "speed", "acceleration", "standstill", "position"):
+        yield (*place, "actor"), f"the kind {kind} names agents by `agent` and `reference`"
+    if trigger.value and kind in PHASE_KINDS:
+        yield (*place, "value"), f"the kind {kind} has none; `delay` waits after the phase"
     if kind == "position" and trigger.position is None:
         yield place, "key 'position' is missing"
     if trigger.position is not None:
@@ -232,7 +238,7 @@ def _constant_condition(trigger: PhaseTrigger, place: Place, actors: Sequence[Ac
         yield (*place, "value"), f"never fires: {kind} is never below 0"
     if kind == "always" and trigger.edge != "none":
         yield (*place, "edge"), "never fires: what always holds never changes"
-    elif kind in ("phase_start", "phase_end", "travelled") and trigger.edge == "falling" and rule != "below":
+    elif trigger.edge == "falling" and (kind in PHASE_KINDS or (kind == "travelled" and rule == "above")):
         yield (*place, "edge"), f"never fires: {kind} never ceases to hold"
     elif kind in ("time", "after") and trigger.edge != "none" and rule == "below" and trigger.edge == "rising":
         yield (*place, "edge"), f"never fires: {kind} is below its value from the start"

@@ -153,6 +153,7 @@ def move_one(
         state.travelled[b, i] = state.travelled[b, i] + wp.abs(step_length)
         speed = new_speed
     elif power[2] > 0.0:
+        surface = bank.surface[e]
         if is_scripted == 1:
             # the speed is the script's: the pedals give this acceleration in the limits of nobody's engine and brakes
             acceleration = (target_place[3] - speed) / dt
@@ -160,6 +161,7 @@ def move_one(
             if acceleration > 0.0:
                 control = wp.vec4(1.0, 0.0, control[2], 0.0)
             power = wp.vec4(wp.abs(acceleration), wp.abs(acceleration), 1.0e3, 0.0)
+            surface = wp.vec3(wp.abs(acceleration), surface[1], surface[2])
         if speed != 0.0 or control[0] > 0.0:
             result = bicycle(
                 pose,
@@ -169,7 +171,7 @@ def move_one(
                 control,
                 bank.body[model],
                 power,
-                bank.surface[e],
+                surface,
                 dt,
                 substeps,
             )
@@ -180,8 +182,9 @@ def move_one(
             speed = result[3]
             if is_scripted == 1:
                 speed = target_place[3]
+            else:
+                state.braking[b, i] = result[5]
             state.wheel[b, i] = result[4]
-            state.braking[b, i] = result[5]
     state.pose[b, i] = pose
     state.accel[b, i] = (speed - state.speed[b, i]) / dt
     state.speed[b, i] = speed

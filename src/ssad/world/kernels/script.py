@@ -25,6 +25,8 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.drive import steer_on_route
 from ssad.world.kernels.shared import boxes_touch, route_at, route_frame, row, wrap
 
+wp.set_module_options({"max_unroll": 0})  # see `traffic`
+
 AT_REST = wp.constant(0.05)  # m/s
 CLOSING = wp.constant(1.0e-3)  # m/s; below, nobody comes closer
 ON_TIME = wp.constant(1.0e-4)  # s by which rounding may delay a time
@@ -682,6 +684,10 @@ def next_speed(
     v = state.speed[b, i]
     running = script.running[b, i][0]
     limits = wp.vec2(power[0], power[1])
+    if bank.kind[bank.model[e, i]] != AgentKind.WALKER:
+        limits = wp.vec2(wp.min(power[0], bank.surface[e][0]), wp.min(power[1], bank.surface[e][0]))
+    level = state.braking[b, i]
+    state.braking[b, i] = 0.0
     if running == 0:
         initial = bank.start[e, i][3]
         return v + wp.clamp(initial - v, -limits[1] * dt, limits[0] * dt)
@@ -711,6 +717,11 @@ def next_speed(
             acceleration = result[1]
             is_done = int(result[2])
         else:
+            if motion[1] == 0.0 and power[3] > 0.0 and target < v - ROUNDING:
+                # the brakes of the model build up
+                built_up = wp.min(level + dt / power[3], 1.0)
+                limits = wp.vec2(limits[0], wp.min(0.5 * (level + built_up) * power[1], limits[1]))
+                state.braking[b, i] = built_up
             speed = v + wp.clamp(target - v, -limits[1] * dt, limits[0] * dt)
             if wp.abs(speed - target) < ROUNDING:
                 speed = target
@@ -817,6 +828,19 @@ def advance_on_rail(
 
 
 @wp.func
+def rail_under(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int) -> wp.vec2:
+    """Return the place of an agent along its route and how far left of it that is, m."""
+    route = bank.route[state.episode[b], i]
+    point = row(roads.path, route[0] + state.progress[b, i])
+    pose = state.pose[b, i]
+    c = wp.cos(point[2])
+    s = wp.sin(point[2])
+    dx = pose[0] - point[0]
+    dy = pose[1] - point[1]
+    return wp.vec2(float(state.progress[b, i]) + c * dx + s * dy, c * dy - s * dx)
+
+
+@wp.func
 def run_one(
     bank: EpisodeArrays,
     roads: Roads,
@@ -830,6 +854,9 @@ def run_one(
     """Decide the motion of a scripted agent in this step."""
     e = state.episode[b]
     controller = state.controller[b, i]
+    if controller != Controller.SCRIPT and bank.script[e, i][2] > 0:
+        # another driver has it now; the script would go on from where that one leaves it
+        script.rail[b, i] = rail_under(bank, roads, state, b, i)
     if controller == Controller.FOLLOW:
         if script.running[b, i][0] > 0:
             state.cruise[b, i] = script.course[b, i][1]

@@ -10,7 +10,7 @@ from pathlib import Path
 from ssad.core.errors import MapError, unknown_name
 from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.safeio import home_folder, read_text
-from ssad.world.roads.bake import bake
+from ssad.world.roads.bake import LANELET2, bake
 from ssad.world.roads.random_towns import RANDOM, write_random_town
 from ssad.world.roads.signals import signal_names
 from ssad.world.roads.xodr import MAX_BYTES, Network, read_network
@@ -32,7 +32,7 @@ def is_town(name: str) -> bool:
 
 
 def load_town(name: str) -> LaneGraph:
-    """Return the lane graph of a town by its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
+    """Return the lane graph of a town by its name, or the path of a baked town (.npz) or a map (.xodr, .osm).
 
     A graph is immutable and cached. UnknownNameError lists the closest names; MapError describes the problem of a
     file.
@@ -44,10 +44,10 @@ def load_town(name: str) -> LaneGraph:
         return _stored(str(path), path.stat().st_mtime_ns)
     if RANDOM.fullmatch(name):
         return _random(name)
-    if Path(name).suffix == ".xodr":
+    if Path(name).suffix in (".xodr", LANELET2):
         return bake(Path(name))
     if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
-        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr)")
+        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr, .osm)")
     raise unknown_name("town", name, town_names())
 
 
