@@ -172,7 +172,7 @@ def test_no_lane_change_begins_before_a_fast_car(behind: float) -> None:
         assert ahead < -10.0
 
 
-@pytest.mark.parametrize("ends", [100.0, 150.0, 300.0])
+@pytest.mark.parametrize("ends", [100.0, 175.0, 300.0])
 def test_it_is_back_in_its_lane_where_the_other_ends(ends: float) -> None:
     """Whether or not there was room to pass: nobody drives on beyond the end of a lane."""
     slow = steady("slow", 60.0, 0.0, 3.0)
