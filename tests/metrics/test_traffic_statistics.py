@@ -65,10 +65,10 @@ def test_time_gaps_are_those_of_followers_that_move() -> None:
 
 
 def test_a_stop_has_one_standstill_gap() -> None:
-    speed = np.array([5.0, 0.1, 0.0, 0.0, 4.0, 0.0])[:, None]
-    gap = np.array([9.0, 2.6, 2.5, 2.4, 6.0, 3.0])[:, None]
-    leader = np.array([0.0, 0.0, 0.0, 0.0, 5.0, 0.0])[:, None]
-    np.testing.assert_allclose(standstill_gaps(gap, speed, leader, np.ones((6, 1), bool)), [2.4, 3.0])
+    speed = np.array([5.0, 0.1, 0.0, 0.0, 4.0, 0.0, 3.0, 0.0])[:, None]
+    gap = np.array([9.0, 2.6, 2.5, 2.4, 6.0, 3.0, 40.0, 30.0])[:, None]
+    leader = np.array([0.0, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0, 0.0])[:, None]
+    np.testing.assert_allclose(standstill_gaps(gap, speed, leader, np.ones((8, 1), bool)), [2.4, 3.0])
 
 
 def test_a_lane_change_leads_to_the_lane_beside() -> None:
@@ -82,15 +82,13 @@ def test_queues_discharge_with_the_headways_of_their_making() -> None:
     since = np.concatenate([moments, moments[::-1], [9.0]])
     group = np.array([0] * 5 + [1] * 5 + [0])
     queued = np.array([True] * 10 + [False])
-    measured = queue_discharge(since, group, queued)
+    measured = queue_discharge(since, group, queued, least=2)
     # the vehicle that came late ends the first queue, after its third
     np.testing.assert_allclose(measured.headways, [2.0, 2.0])
     np.testing.assert_allclose(measured.first, [3.0, 3.0])
     assert measured.lost == pytest.approx((3.0 - 2.0) + (2.5 - 2.0) + (2.2 - 2.0))
 
-
-def test_without_a_long_queue_there_is_no_lost_time() -> None:
-    assert math.isnan(queue_discharge(np.array([3.0]), np.array([0]), np.array([True])).lost)
+    assert math.isnan(queue_discharge(since, group, queued).lost)
 
 
 def crossing(delay: float, *, speed: float = 10.0) -> np.ndarray:

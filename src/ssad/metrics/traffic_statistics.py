@@ -20,6 +20,7 @@ Ints = npt.NDArray[np.int64]
 STANDS = 0.2  # m/s
 FOLLOWS = 5.0  # s: a vehicle with a larger time gap drives freely
 MOVES = 3.0  # m/s from which a time gap says something
+QUEUE_GAP = 8.0  # m between two that stand in one queue, at most
 CELL = 1.0  # m, side of the cells in which paths cross
 CROSSES = math.radians(30.0)  # least difference of two headings of paths that cross
 QUEUE_START = 4  # first position in a queue whose headway counts as saturated (Highway Capacity Manual)
@@ -86,6 +87,8 @@ def time_gaps(gap: F64, speed: F64, present: Bool) -> F64:
 def standstill_gaps(gap: F64, speed: F64, leader_speed: F64, present: Bool) -> F64:
     """Return the gaps of vehicles that stand behind a standing leader, m: one value for each stop, at its end.
 
+    Gaps above 8 m are left out: such a vehicle stands for another reason.
+
     Args:
         gap: [T, N] m, infinite without a leader.
         speed: [T, N] m/s.
@@ -95,7 +98,7 @@ def standstill_gaps(gap: F64, speed: F64, leader_speed: F64, present: Bool) -> F
     stands = present & (np.abs(speed) < STANDS) & (np.abs(leader_speed) < STANDS) & np.isfinite(gap)
     last = stands.copy()
     last[:-1] &= ~stands[1:]
-    return np.asarray(gap[last], np.float64)
+    return np.asarray(gap[last & (gap < QUEUE_GAP)], np.float64)
 
 
 def lane_changes(lane: Ints, left: Ints, right: Ints, present: Bool) -> int:
@@ -120,8 +123,8 @@ class Discharge:
     Attributes:
         headways: Saturated headways, s: from the fourth vehicle of a queue on.
         first: Time from the beginning of green until the first vehicle of a queue crosses the line, s.
-        lost: Start-up lost time, s: what the first three headways exceed the mean saturated one, summed; NaN without
-            saturated headways.
+        lost: Start-up lost time, s: what the first three headways exceed the mean saturated one, summed; NaN with fewer
+            than `least` saturated headways.
     """
 
     headways: F64
@@ -129,13 +132,14 @@ class Discharge:
     lost: float
 
 
-def queue_discharge(since_green: F64, group: Ints, queued: Bool) -> Discharge:
+def queue_discharge(since_green: F64, group: Ints, queued: Bool, *, least: int = 10) -> Discharge:
     """Measure the discharge of queues from the moments at which vehicles cross stop lines.
 
     Args:
         since_green: [E] s from the beginning of green to each crossing.
         group: [E] number of the queue: one line in one cycle.
         queued: [E] whether the vehicle stood before the line during red. A queue ends before the first that did not.
+        least: Saturated headways without which there is no lost time.
 
     Source: Highway Capacity Manual, 7th edition, chapter 31 (field measurement of saturation flow).
     """
@@ -148,8 +152,10 @@ def queue_discharge(since_green: F64, group: Ints, queued: Bool) -> Discharge:
         length = len(stood) if stood.all() else int(np.argmin(stood))
         for position, headway in enumerate(np.diff(moments[:length], prepend=0.0).tolist()):
             (early[position] if position < QUEUE_START - 1 else saturated).append(headway)
-    mean = float(np.mean(saturated)) if saturated else math.nan
-    lost = sum(float(np.mean(values)) - mean for values in early if values) if saturated else math.nan
+    lost = math.nan
+    if len(saturated) >= least:
+        mean = float(np.mean(saturated))
+        lost = sum(float(np.mean(values)) - mean for values in early if values)
     return Discharge(np.array(saturated), np.array(early[0]), lost)
 
 
