@@ -5,6 +5,9 @@
 drives, so that priority alone decides. Prints a table and where it happened. `--json FILE` keeps both after every batch
 of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs/results/traffic.md, with what other
 files hold (`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
+
+`--human` measures how much the traffic is like that of people: headways, gaps, speeds, braking, junctions, signals,
+lane changes, beside published figures. With `--page` it writes their tables and picture.
 """
 
 from __future__ import annotations
@@ -59,6 +62,7 @@ LENGTH = 3500.0  # m of a route
 SETTLE = 10.0  # s at the start that do not count: vehicles begin where no traffic has put them
 CYCLES = 3.0  # signal cycles after which a vehicle that stood all the time is in a queue that does not clear
 LEAST_CYCLE = 32.0  # s, where a town has no signals
+RECORDED = 8  # scenes side by side of which every step is kept
 KINDS = ("contacts", "off_road", "stuck")
 
 Row = dict[str, Any]  # of a town: its name, vehicle-hours, number of scenes, and what has happened, by kind
@@ -209,6 +213,7 @@ def main() -> None:
     """Drive, print, and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--towns", default=",".join(town_names()), help="names or files, with commas")
+    parser.add_argument("--human", action="store_true", help="statistics beside published ones of human driving")
     parser.add_argument("--hours", type=float, default=20.0, help="vehicle-hours in each town")
     parser.add_argument("--vehicles", type=int, default=40, help="in each scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
@@ -222,6 +227,9 @@ def main() -> None:
     parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
     start_warp_quietly()
+    if given.human:
+        compare_with_people(given)
+        return
     traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
     about = traffic_of | {"first": given.first}
     rows = kept(given.json, about) if given.json and given.json.is_file() else {}
@@ -248,6 +256,32 @@ def main() -> None:
         towns = {row["town"]: [other for other in every if other["town"] == row["town"]] for row in every}
         own = together("our own", [row for row in every if row["town"] in BUILT_IN])
         page([*(together(town, parts) for town, parts in towns.items()), own, total])
+
+
+def compare_with_people(given: argparse.Namespace) -> None:
+    """Measure the traffic beside published statistics of human driving; print, and write."""
+    from benchmarks.traffic_human import drive_town, load, show, write_page
+
+    about = {"world": VERSION, "drivers": "uniform", "vehicles": given.vehicles, "minutes": given.minutes}
+    towns = load(given.json)["towns"] if given.json and given.json.is_file() else []
+    measured = {town["town"] for town in towns}
+    scenes = max(1, math.ceil(given.hours * 60.0 / (given.vehicles * given.minutes)))
+    for name in filter(None, given.towns.split(",")):
+        graph = load_town(name)
+        if graph.name in measured:
+            continue
+        routes = town_routes(graph, ROUTES, LENGTH)
+        keys = range(given.first, given.first + scenes)
+        episodes = [traffic(graph, routes, given.vehicles, key=k, green=given.signals == "green") for k in keys]
+        size = min(given.scenes, RECORDED)
+        batches = [episodes[first : first + size] for first in range(0, scenes, size)]
+        towns.append(drive_town(graph, batches, seconds=60.0 * given.minutes, device=given.device))
+        if given.json:
+            given.json.write_text(json.dumps(about | {"towns": towns}) + "\n", encoding="utf-8")
+    show(towns)
+    if given.page:
+        stored = [load(file) for file in given.also]
+        write_page({run["drivers"]: run["towns"] for run in [about | {"towns": towns}, *stored]})
 
 
 def together(name: str, rows: Sequence[Row]) -> Row:

@@ -47,6 +47,15 @@ def test_round_trip_to_the_bit(tmp_path: Path) -> None:
     assert (tmp_path / "t.npz").read_bytes() == before
 
 
+def test_stated_heights_are_stored_and_checked(tmp_path: Path) -> None:
+    trace = replace(make_trace(), heights=(1.5, 1.4, 1.8))
+    save_trace(tmp_path / "t.npz", trace)
+    assert load_trace(tmp_path / "t.npz").heights == (1.5, 1.4, 1.8)
+    save_trace(tmp_path / "t.npz", replace(trace, heights=(1.5,)))
+    with pytest.raises(FormatError, match="heights of 3 agents"):
+        load_trace(tmp_path / "t.npz")
+
+
 def test_without_signals(tmp_path: Path) -> None:
     trace = replace(make_trace(), signal_ids=np.zeros(0, np.int32), signal=np.zeros((T, 0), np.uint8))
     save_trace(tmp_path / "t.npz", trace)
@@ -60,6 +69,8 @@ def test_any_change_shows(name: str) -> None:
     if isinstance(value, np.ndarray):
         changed = value.copy()
         changed.reshape(-1).view(np.uint8)[-1] ^= 1
+    elif isinstance(value, tuple):
+        changed = (1.5,) * A
     else:
         changed = value + 1 if isinstance(value, float) else value + "x"
     other = replace(trace, **{name: changed})
@@ -130,6 +141,7 @@ def test_the_hash_is_the_same_for_ever() -> None:
     """Results on disk hold it."""
     small = {f.name: np.zeros(0) for f in fields(EpisodeTrace)}
     small |= {"key": "k", "town": "Town", "dt": 0.1, "names": ("ego",), "models": ("car",), "end": "complete"}
+    small["heights"] = ()
     assert trace_hash(EpisodeTrace(**small)) == SMALL_HASH  # type: ignore[arg-type]
 
 

@@ -2,28 +2,76 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from ssad.core.triggers import all_phases
+from ssad.core.types import (
+    Actor,
+    Arrival,
+    Controller,
+    Episode,
+    LateralPhase,
+    Phase,
+    PhaseTrigger,
+    TriggerKind,
+)
 from ssad.scenarios.dynamic import SCENARIOS, build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.knowledge._kind import EGO_START, TARGET_SPEED_SPREAD
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
+from ssad.world.world import World
 
 DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "how-to" / "write-scenarios.md").read_text()
 PAGE = (DOCS / "reference" / "scenarios.md").read_text()
 
 
-@pytest.mark.parametrize("text", re.findall(r"```yaml\n(.*?)```", GUIDE, re.S))
-def test_the_examples_become_episodes(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "example.yaml"
+EXAMPLES = re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)
+SCENARIO_EXAMPLES = [text for text in EXAMPLES if text.startswith("name:")]
+ACTOR_EXAMPLES = [text for text in EXAMPLES if text.startswith("- name:")]
+
+
+def built(text: str, folder: Path) -> Episode:
+    path = folder / "example.yaml"
     path.write_text(text)
     (scenario,) = load_scenarios(path)
-    episode = build_episode(scenario, load_town(scenario.town), seed=0)
-    assert len(episode.agents) == 3
+    return build_episode(scenario, load_town(scenario.town), seed=0)
+
+
+@pytest.mark.parametrize("text", SCENARIO_EXAMPLES)
+def test_the_examples_become_episodes(text: str, tmp_path: Path) -> None:
+    assert len(built(text, tmp_path).agents) == 3
+
+
+def test_everything_in_the_examples_of_actors_happens(tmp_path: Path) -> None:
+    """Every phase begins while an ego at 8 m/s passes."""
+    head = next(text for text in SCENARIO_EXAMPLES if "actors:" in text).split("actors:")[0]
+    episodes = [built(f"{head}limits: {{contact: count}}\nactors:\n{text}", tmp_path) for text in ACTOR_EXAMPLES]
+    assert len(ACTOR_EXAMPLES) + len(SCENARIO_EXAMPLES) == len(EXAMPLES) >= 6
+    world = World(episodes, {"ProvingGround": load_town("ProvingGround")}, ego=Controller.FOLLOW)
+    for _ in range(140):
+        world.step()
+    begun = world.array("script.begun") > 0
+    for scene, episode in enumerate(episodes):
+        count = sum(len(all_phases(agent)) for agent in episode.agents)
+        assert begun[scene, :count].all(), ACTOR_EXAMPLES[scene]
+
+
+@pytest.mark.parametrize("table", [Actor, Phase, LateralPhase, PhaseTrigger, Arrival])
+def test_the_reference_has_every_key(table: type) -> None:
+    for field in dataclasses.fields(table):
+        assert f"`{field.name}`" in PAGE, field.name
+
+
+def test_the_reference_has_every_kind_of_condition() -> None:
+    table = PAGE[PAGE.index("| Kind | Holds if |") : PAGE.index("A condition that can never hold")]
+    kinds = [row.split("|")[1] for row in table.splitlines() if row.startswith("| `")]
+    assert set(get_args(TriggerKind)) == set(re.findall(r"`(\w+)`", " ".join(kinds)))
 
 
 @pytest.mark.parametrize("kind", SCENARIOS)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.special import gammaincc
 
-from ssad.metrics.rare_events import weighted_estimate, weighted_limits
+from ssad.metrics.rare_events import repeated_estimate, weighted_estimate, weighted_limits
 
 MANY = 1e9  # episodes: so many that the events are rare
 
@@ -37,3 +39,12 @@ def test_an_estimate_counts_events_and_how_many_equal_ones_they_are_worth() -> N
     assert (found.probability, found.episodes, found.events) == (pytest.approx(0.06), 100, 4)
     assert found.effective == pytest.approx(36.0 / 10.0)
     assert 0.0 < found.low < 0.06 < found.high < 1.0
+
+
+@pytest.mark.parametrize("value", [0.0, 0.25])
+def test_one_repeat_has_a_mean_and_no_limits(value: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimate = repeated_estimate([value], "splitting", episodes=20, events=5, work=1.0)
+    assert estimate.probability == value
+    assert np.isnan([estimate.low, estimate.high, estimate.effective]).all()

@@ -13,7 +13,7 @@ import torch
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeLimits, EpisodeTrace, SignalState
+from ssad.core.types import AgentKind, Body, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, SignalState
 from ssad.rendering import onboard as loop_sensors
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.lamps import SceneLamp
@@ -112,6 +112,25 @@ def test_what_was_shown_is_what_is_rendered_from_the_trace(driven) -> None:
     pictures = [watcher.shown["front", scene, agent, 4] for scene in range(2) for agent in (0, 1)]
     assert all(picture.std() > 10 for picture in pictures)
     assert len({picture.tobytes() for picture in pictures}) == 4
+
+
+def test_stated_sizes_are_rendered_alike_in_the_loop_and_from_the_trace() -> None:
+    ego, car = episodes()[2].agents[:2]
+    x, y = ego.pose.x + 15.0 * np.cos(ego.pose.yaw), ego.pose.y + 15.0 * np.sin(ego.pose.yaw)
+    ahead = replace(car, pose=Pose(float(x), float(y), ego.pose.yaw + 0.5))
+    limits = EpisodeLimits(max_steps=1)
+    readings = []
+    for body in (Body(), Body(length=9.123, height=3.21)):
+        episode = replace(episodes()[2], agents=(ego, replace(ahead, body=body)), limits=limits)
+        watcher = Watcher("front", "lidar")
+        (trace,) = rollout(World([episode], {town().name: town()}), watcher, sensors=both(Onboard()))
+        for name, sensor in both(Onboard()).items():
+            shown = watcher.shown[name, 0, 0, 0]
+            assert np.array_equal(shown, sensor.of_trace(trace, town(), steps=[0])[0])
+            readings.append(shown)
+    front, points, long_front, long_points = readings
+    assert not np.array_equal(front, long_front)
+    assert not np.array_equal(points, long_points)
 
 
 def test_a_reading_does_not_depend_on_who_else_is_in_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:

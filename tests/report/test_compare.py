@@ -11,7 +11,7 @@ from helpers.run_folder import GROUPS, driving_line, write_lines, write_run
 from typer.testing import CliRunner
 
 from ssad.cli import app
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, StoreError
 from ssad.report.compare import compare_runs, write_comparison
 from ssad.report.load import load_run
 
@@ -210,3 +210,18 @@ def test_runs_that_cannot_be_compared(tmp_path: Path):
     header = dict(load_run(first).header) | {"cells": [{"key": line["key"], "name": line["key"]} for line in lines]}
     with pytest.raises(ConfigError, match="shares no cell"):
         compare_runs([first, write_run(tmp_path / "renamed", header, lines)])
+
+
+def test_records_of_another_shape_are_refused_in_a_line(tmp_path: Path):
+    first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=8)
+    lines = [json.loads(line) for line in (second / "results.jsonl").read_text().splitlines()]
+    for name, value in (("spec", {}), ("spec", {"scenario": []}), ("metrics", None)):
+        write_lines(second, [line | {name: value} for line in lines])
+        with pytest.raises(StoreError, match=r"one or .*two: its records are not those of kind driving: \w+Error"):
+            write_comparison([first, second], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_header_without_a_suite_has_a_title(tmp_path: Path):
+    folder = driving_run(tmp_path / "one", hits=8, suite=None, command=None)
+    assert load_run(folder).title == "SSAD"

@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, EpisodeLimits, Phase, PhaseTrigger, Pose
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_simulator
-from ssad.world.kernels.traffic import LONGEST
+from ssad.world.episode_arrays import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
 from ssad.world.world import World
@@ -208,12 +208,12 @@ def test_a_phase_waits_after_the_one_before_it(device: str) -> None:
     middle = firsts[1] + 8
     assert begun(world, middle)[1] == hashes[:middle]
     kept = world.snapshot()
-    assert (world.array("since")[:, 1] > 0).tolist() == [False, True, True, False]
+    assert (world.array("script.begun")[:, 0] > 0).tolist() == [False, True, True, True]
     other = World(scenes, GRAPHS, device=device)
     other.restore(kept)
     assert begun(other, 40)[1] == hashes[middle : middle + 40]
     other.restore(kept)
-    other.put("since", world.array("since") - 1)
+    other.put("script.begun", world.array("script.begun") + 1)
     assert [a != b for a, b in zip(other.hashes(), world.hashes(), strict=True)] == [True] * 4
 
 
@@ -354,8 +354,8 @@ def test_follower_keeps_its_route_without_wobble() -> None:
     assert np.abs(np.diff(steer, n=2)).max() < 0.12
 
 
-def test_no_model_is_longer_than_the_autopilot_reckons_with() -> None:
-    assert max(m.length for m in MODELS.values()) / 2 <= float(LONGEST)
+def test_no_model_is_longer_than_every_episode_reckons_with() -> None:
+    assert max(m.length for m in MODELS.values()) / 2 <= LONGEST
 
 
 def test_where_turns_on_red_are_forbidden_the_autopilot_waits_and_a_turn_counts_as_run() -> None:

@@ -26,7 +26,10 @@ _PER_AGENT = ("x", "y", "yaw", "speed", "active")
 
 def _meta(trace: EpisodeTrace) -> dict[str, Any]:
     meta: dict[str, Any] = {name: getattr(trace, name) for name in _META}
-    return meta | {"names": list(trace.names), "models": list(trace.models), "dt": float(trace.dt)}
+    # Absent where models say it all, so that the hash of such a trace is that of earlier versions.
+    heights = {"heights": list(trace.heights)} if trace.heights else {}
+    del meta["heights"]
+    return meta | {"names": list(trace.names), "models": list(trace.models), "dt": float(trace.dt)} | heights
 
 
 def _arrays(trace: EpisodeTrace) -> dict[str, npt.NDArray[Any]]:
@@ -81,6 +84,7 @@ def load_trace(path: str | Path) -> EpisodeTrace:
     meta = safeio.parse_json(stored.pop("meta").tobytes(), str(path))
     if not isinstance(meta, dict) or meta.pop("format", None) != FORMAT:
         raise FormatError(f"{path}: an episode trace of another format; run the suite again into a new folder")
+    meta.setdefault("heights", ())
     missing = (set(_META) - set(meta)) | (set(_ARRAYS) - set(stored))
     mistyped = [name for name, dtype in _ARRAYS.items() if name in stored and stored[name].dtype != dtype]
     if missing or mistyped:
@@ -89,7 +93,12 @@ def load_trace(path: str | Path) -> EpisodeTrace:
     for name in _PER_AGENT:
         if stored[name].shape != (steps, agents):
             raise FormatError(f"{path}: not a whole episode trace ({name} has shape {stored[name].shape})")
-    meta["names"], meta["models"] = tuple(meta["names"]), tuple(meta["models"])
+    heights = meta["heights"]
+    if not isinstance(heights, list | tuple) or (
+        heights and (len(heights) != agents or not all(isinstance(value, float) and value > 0.0 for value in heights))
+    ):
+        raise FormatError(f"{path}: not a whole episode trace (heights of {agents} agents are not {heights!r})")
+    meta["names"], meta["models"], meta["heights"] = (tuple(meta[name]) for name in ("names", "models", "heights"))
     trace_fields: dict[str, Any] = {name: meta[name] for name in _META} | {name: stored[name] for name in _ARRAYS}
     return EpisodeTrace(**trace_fields)
 
@@ -114,8 +123,8 @@ def motion_hash(trace: EpisodeTrace) -> str:
 def first_difference(first: EpisodeTrace, second: EpisodeTrace) -> str | None:
     """None when equal to the bit, else one line: which array differs first, at which step."""
     for name in _META:
-        if _meta(first)[name] != _meta(second)[name]:
-            return f"{name}: {_meta(first)[name]!r} against {_meta(second)[name]!r}"
+        if _meta(first).get(name) != _meta(second).get(name):
+            return f"{name}: {_meta(first).get(name)!r} against {_meta(second).get(name)!r}"
     left_arrays, right_arrays = _arrays(first), _arrays(second)
     differences: list[tuple[int, str]] = []
     for name in _ARRAYS:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError
+from ssad.core.folders import data_path
 from ssad.core.types import F64, I32, Bool
 
 MAX_FILE_BYTES: Final = 1 << 30  # size limit of an annotation file
@@ -100,13 +101,17 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
 
     Raises:
         FormatError: A part is missing, malformed, or refers to an image or category that does not exist.
+        StoreError: A picture leads out of the folder (`ssad.core.folders.data_path`).
     """
     content = safeio.read_json(path, limit=MAX_FILE_BYTES)
     required_lists = ("images", "annotations", "categories")
     if not isinstance(content, dict) or any(not isinstance(content.get(key), list) for key in required_lists):
         raise FormatError(f"{path}: no COCO annotations (lists `images`, `annotations` and `categories`)")
     default_folder = path.parent.parent / "images"
-    folder = images or (default_folder if default_folder.is_dir() else path.parent)
+    if images is None and default_folder.is_dir():
+        data_path(path.parent.parent, "images")
+        images = default_folder
+    folder = images or path.parent
     try:
         class_names = {int(category["id"]): str(category["name"]) for category in content["categories"]}
         annotations_by_image: dict[int, list[Mapping[str, Any]]] = {
@@ -124,9 +129,19 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
             _parse_image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
             for record in content["images"]
         )
+        _check_links(folder, pictures)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
     return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
+
+
+def _check_links(folder: Path, pictures: Sequence[CocoImage]) -> None:
+    """Raise StoreError if a picture, or a folder of pictures, leads out of their folder."""
+    for parent in {picture.file.parent for picture in pictures} - {folder}:
+        data_path(folder, parent.relative_to(folder))
+    for picture in pictures:
+        if picture.file.is_symlink():
+            data_path(folder, picture.file.relative_to(folder))
 
 
 def _parse_image(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import is_linkable, link_remedy
 from ssad.core.image_files import is_image
 from ssad.datasets.point_files import KITTI_COLUMNS, NUSCENES_COLUMNS
 
@@ -55,8 +56,9 @@ class FolderFile:
 def list_folder(root: Path) -> list[FolderFile]:
     """Return every file below a folder, in the order of the keys.
 
-    Symbolic links are not followed: one that stays inside the folder is listed as a link, so nothing is listed twice
-    and no circle is walked; one that leads out of it, or nowhere, is refused.
+    A symbolic link that stays inside the folder is not followed but listed as a link, so nothing is listed twice and
+    no circle is walked. One that leads out of it is followed once where `SSAD_DATA_LINKS` allows it
+    (`ssad.core.folders.is_linkable`), and refused elsewhere, as is one that leads nowhere.
 
     Args:
         root: The folder; links above it are the user's own.
@@ -66,7 +68,7 @@ def list_folder(root: Path) -> list[FolderFile]:
     """
     resolved_root = root.resolve()
     files: list[FolderFile] = []
-    folders = [resolved_root]
+    folders, linked_folders = [resolved_root], set[Path]()
     while folders:
         folder = folders.pop()
         try:
@@ -78,8 +80,16 @@ def list_folder(root: Path) -> list[FolderFile]:
             path = Path(entry.path)
             if entry.is_dir(follow_symlinks=False):
                 folders.append(path)
-            else:
-                files.append(_describe(path, entry, resolved_root))
+                continue
+            file = _describe(path, entry, resolved_root)
+            if file.kind == "link" and not file.target:
+                destination = path.resolve()
+                if not any(destination.is_relative_to(folder) for folder in linked_folders):
+                    linked_folders.add(destination)
+                    folders.append(path)
+                    continue
+                file = replace(file, kind="refused", target="a symbolic link to a folder that is listed already")
+            files.append(file)
     return sorted(files, key=lambda file: file.key)
 
 
@@ -89,11 +99,14 @@ def _describe(path: Path, entry: os.DirEntry[str], root: Path) -> FolderFile:
         destination = Path(os.path.realpath(path))
         if not destination.exists():
             return FolderFile(key, path, "refused", "a symbolic link that leads nowhere; remove it")
-        if not destination.is_relative_to(root):
-            reason = f"a symbolic link that leads out of {root}; put what it leads to in its place"
+        if destination.is_relative_to(root):
+            return FolderFile(key, path, "link", destination.relative_to(root).as_posix())
+        if not is_linkable(destination):
+            reason = f"a symbolic link that leads out of {root}; {link_remedy(destination)}"
             return FolderFile(key, path, "refused", reason)
-        return FolderFile(key, path, "link", destination.relative_to(root).as_posix())
-    if not entry.is_file(follow_symlinks=False):
+        if destination.is_dir():
+            return FolderFile(key, path, "link")
+    if not entry.is_file():
         return FolderFile(key, path, "refused", "neither a file nor a folder; remove it")
     try:
         return FolderFile(key, path, _kind(path, key.split("/")[:-1]))

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import rich.table
 from pydantic import ValidationError
 
 from ssad.core import safeio
@@ -19,11 +16,12 @@ from ssad.engine.run import run_json
 from ssad.engine.store import read_run
 from ssad.experiments.suites import kind_of
 from ssad.report.join import join_runs
-from ssad.report.load import Run, load_run
+from ssad.report.load import Run, load_run, read_as_kind
 from ssad.report.markdown import run_markdown
+from ssad.report.matrix import run_matrices, sweep_tables, terminal_matrices
 from ssad.report.pages import TABLE_HASH, table_hash
 from ssad.report.tables import write_tables
-from ssad.report.terminal import terminal_table
+from ssad.report.terminal import TerminalTable, terminal_table
 from ssad.report.verdict import complete_verdict
 
 
@@ -98,9 +96,10 @@ def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
         StoreError: The folder holds no run, has no results, or cannot be written.
     """
     run = load_run(folder)
-    with _read_as_kind(run):
+    with read_as_kind(run):
         page, tables = (kind or kind_of_run(run)).page(run)
-    write_tables(run.folder, tables)
+        all_tables = [*tables, *sweep_tables(run)]
+    write_tables(run.folder, all_tables)
     page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
@@ -119,12 +118,12 @@ def report_markdown(folders: Sequence[Path | str]) -> str:
     """
     run = join_runs([load_run(folder) for folder in folders])
     kind = kind_of_run(run)
-    with _read_as_kind(run):
+    with read_as_kind(run):
         _, tables = kind.page(run)
-        return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
+        return run_markdown(run, [*tables, *run_matrices(run)], complete_verdict(run, kind.verdict(run)))
 
 
-def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
+def summary(folder: Path | str, kind: Kind | None = None) -> TerminalTable:
     """Main table of a run for the terminal: n and interval of the first metric, the values of the others.
 
     Args:
@@ -135,22 +134,16 @@ def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
         StoreError: The folder holds no run with results.
     """
     run = load_run(folder)
-    with _read_as_kind(run):
+    with read_as_kind(run):
         return terminal_table(run, (kind or kind_of_run(run)).summary(run))
 
 
-@contextlib.contextmanager
-def _read_as_kind(run: Run) -> Iterator[None]:
-    """Make an error of a page that is made of a run's records one line: the records may come from anywhere.
+def matrices(folder: Path | str) -> list[TerminalTable]:
+    """Return the matrices of a run with a sweep for the terminal; empty: it has no sweep.
 
     Raises:
-        StoreError: The records are not those of the kind. Its cause is the error, for authors of kinds.
+        StoreError: The folder holds no run with results.
     """
-    try:
-        yield
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        raise StoreError(
-            f"{run.folder}: its records are not those of kind {run.kind}: {type(error).__name__}: {error} "
-            f"({Path(place.filename).name}:{place.lineno}); run the suite again"
-        ) from error
+    run = load_run(folder)
+    with read_as_kind(run):
+        return terminal_matrices(run)

@@ -18,7 +18,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Controller, Episode, EpisodeAgent, Pose
 from ssad.interchange.commonroad_lanes import write_lanes
 from ssad.interchange.commonroad_xml import TYPES, VERSION, add_element, decimal, format_source, points
-from ssad.world.models import model
+from ssad.world.models import agent_model, model
 from ssad.world.roads import route_along
 
 DATE: Final = "2026-01-01"  # required by the format; fixed, so that a scenario always gives the same text
@@ -118,7 +118,7 @@ class _Writer:
         return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
 
     def _write_shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
-        body = model(agent.model)
+        body = agent_model(agent)
         shape = add_element(add_element(obstacle, "shape"), "rectangle")
         add_element(shape, "length", body.length)
         add_element(shape, "width", body.width)

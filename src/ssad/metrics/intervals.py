@@ -289,9 +289,10 @@ def _spread(contributions: F64, clusters: Clusters) -> _Spread:
         stratum_count = np.full(contributions.shape[-1], cluster_counts[0])
     else:
         stratum_count = cluster_counts[clusters.stratum]
-    variance = (contributions**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
     cluster_count, max_freedom = contributions.shape[-1], float((cluster_counts - 1.0).sum())
     with np.errstate(divide="ignore", invalid="ignore"):
+        # One cluster in all has no variance: 0 / 0 is NaN, and so is every limit that needs one.
+        variance = (contributions**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
         active_clusters = (contributions**2).sum(axis=-1) ** 2 / (contributions**4).sum(axis=-1)
         third_moment = (
             contributions**3 * stratum_count**2 / np.maximum((stratum_count - 1.0) * (stratum_count - 2.0), 1.0)

@@ -13,7 +13,7 @@ from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.target import Target, TargetSign, TargetWalker
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, agent_size
 
 SIGN: Final = "stop_sign"
 FIRST_SIGN: Final = 1 << 16  # tag of a town's sign 0: no scene has so many agents
@@ -40,16 +40,20 @@ class AgentEdit:
         return AgentKind.WALKER if isinstance(self.target, TargetWalker) else AgentKind.CAR
 
     @cached_property
-    def _bodies(self) -> dict[str, tuple[Mesh, SceneEdit]]:
+    def _bodies(self) -> dict[tuple[str, tuple[float, ...]], tuple[Mesh, SceneEdit]]:
         return {}
 
-    def body(self, model: str) -> tuple[Mesh, SceneEdit]:
+    def body(self, model: str, size: tuple[float, ...] = ()) -> tuple[Mesh, SceneEdit]:
         """Return the body that plays an agent of a model, or a sign, and the edit for it; built once.
+
+        Args:
+            model: Model of the agent, or `SIGN`.
+            size: Length, width, height of the agent, m; (): those of the model.
 
         Raises:
             ConfigError: The target cannot play an agent of this model, or the attack does not fit on it.
         """
-        if model not in self._bodies:
+        if (model, size) not in self._bodies:
             if isinstance(self.target, TargetSign):
                 mesh = self.target.mesh()
             else:
@@ -59,9 +63,9 @@ class AgentEdit:
                         f"agent {self.agent} is a {model}; the attack is made for a {self.kind.name.lower()}: name "
                         "another agent"
                     )
-                mesh = replace(self.target, size=(model_entry.length, model_entry.width, model_entry.height)).mesh()
-            self._bodies[model] = mesh, self.edit(mesh)
-        return self._bodies[model]
+                mesh = replace(self.target, size=agent_size(model, size)).mesh()
+            self._bodies[model, size] = mesh, self.edit(mesh)
+        return self._bodies[model, size]
 
     def attacked_model(self, models: tuple[str, ...], key: str) -> str:
         """The model of the agent that is attacked in an episode, or `SIGN`. ConfigError: it has no such agent."""
@@ -71,12 +75,16 @@ class AgentEdit:
             raise ConfigError(f"{key}: has agents 0 to {len(models) - 1}; agent {self.agent} cannot be attacked")
         return models[self.agent]
 
-    def meshes(self, model: str) -> dict[Any, Mesh]:
+    def attacked_size(self, sizes: tuple[tuple[float, ...], ...]) -> tuple[float, ...]:
+        """Return the size of the agent that is attacked, m; () for a sign, or for that of its model."""
+        return () if isinstance(self.target, TargetSign) else sizes[self.agent]
+
+    def meshes(self, model: str, size: tuple[float, ...] = ()) -> dict[Any, Mesh]:
         """Return the meshes that the scene must hold, by their own names: the body first, then the cards."""
-        mesh, edit = self.body(model)
-        named_meshes: dict[Any, Mesh] = {("attacked", self.target, model): mesh}
+        mesh, edit = self.body(model, size)
+        named_meshes: dict[Any, Mesh] = {("attacked", self.target, model, size): mesh}
         return named_meshes | {
-            ("attacked card", self.target, model, index): card for index, card in enumerate(edit.meshes())
+            ("attacked card", self.target, model, size, index): card for index, card in enumerate(edit.meshes())
         }
 
     def replace_attacked(

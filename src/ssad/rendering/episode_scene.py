@@ -16,7 +16,7 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose, upright_poses
 from ssad.core.seeding import generator
-from ssad.core.types import F32, F64, I32, U8, Bool, Episode, EpisodeTrace, SignalState
+from ssad.core.types import F32, F64, I32, U8, Body, Bool, Episode, EpisodeTrace, SignalState
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.rendering.camera.scene import RenderScene, SceneObject
@@ -24,7 +24,7 @@ from ssad.rendering.meshes.mesh import Material, Mesh, merge, prism
 from ssad.rendering.scene_objects import PHASES, STRIDE, GroundOccupancy
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import KINDS, REACH, street_signs
-from ssad.world.models import MODELS
+from ssad.world.models import agent_model, agent_size, stated_size, trace_sizes
 from ssad.world.rollout import route_signals
 
 VARIANTS: Final = 4  # bodies that play a model
@@ -39,30 +39,31 @@ LIGHTS: Final = {
 BRIGHT: Final = 1.3  # emission of a lit lens
 SIGNALS_WITHIN: Final = 150.0  # m from the eye
 
-BodyKey = tuple[str, int, int]
-"""Model, which of its `VARIANTS`, and which of the `PHASES` of its cycle."""
+BodyKey = tuple[str, int, int, tuple[float, ...]]
+"""Model, which of its `VARIANTS`, which of the `PHASES` of its cycle, and its size if that is not the model's."""
 
 
 @lru_cache(maxsize=512)
-def body_of(model: str, variant: int, phase: int = 0) -> Mesh:
-    """Return the body that plays a model of the world, in the size of the model.
+def body_of(model: str, variant: int, phase: int = 0, size: tuple[float, ...] = ()) -> Mesh:
+    """Return the body that plays a model of the world.
 
     Args:
         model: Name of the model.
         variant: Number of the body among those of the model.
         phase: Place in the walking cycle or of the pedals, 0 to 7; other bodies have one phase only.
+        size: Length, width, height, m; (): those of the model.
 
     Raises:
         KeyError: Unknown model.
     """
-    size = MODELS[model].length, MODELS[model].width, MODELS[model].height
+    body_size = agent_size(model, size)
     if model not in ACTOR_BODIES:
-        return plain_body(size)
+        return plain_body(body_size)
     body_kind, styles = ACTOR_BODIES[model]
     style = styles[int(generator("body style", model, variant).integers(len(styles)))]
     cycle_phase = 2 * np.pi * phase / PHASES if body_kind in CYCLED else None
     return make_body(
-        body_kind, style=style, size=size, generator=generator("body", model, variant), detail=1, phase=cycle_phase
+        body_kind, style=style, size=body_size, generator=generator("body", model, variant), detail=1, phase=cycle_phase
     )
 
 
@@ -81,6 +82,7 @@ class Appearance:
     Attributes:
         key: Key of the episode.
         models: Model of each agent.
+        sizes: Length, width and height of each agent, m; () for one of the size of its model.
         variants: Number of the body that plays each agent.
         paints: Colour of each agent, linear RGB.
         strides: Phase of each agent's walking cycle at the start, m.
@@ -90,6 +92,7 @@ class Appearance:
 
     key: str
     models: tuple[str, ...]
+    sizes: tuple[tuple[float, ...], ...]
     variants: tuple[int, ...]
     paints: tuple[tuple[float, float, float], ...]
     strides: F64
@@ -99,8 +102,8 @@ class Appearance:
     def bodies(self) -> set[BodyKey]:
         """Return the keys of the bodies that the agents need, in all phases of their cycles."""
         return {
-            (model, variant, phase)
-            for model, variant in zip(self.models, self.variants, strict=True)
+            (model, variant, phase, size)
+            for model, variant, size in zip(self.models, self.variants, self.sizes, strict=True)
             for phase in range(PHASES if _cycles(model) else 1)
         }
 
@@ -207,13 +210,22 @@ class EpisodeScene:
         route = episode.agents[0].route
         assert route is not None  # checked when the world was built
         models = tuple(agent.model for agent in episode.agents)
-        return self._make_appearance(episode.key, models, route_signals(self.graph, route), route.xy)
+        sizes = tuple(
+            stated_size(agent.model, (body.length, body.width, body.height)) if agent.body != Body() else ()
+            for agent, body in ((agent, agent_model(agent)) for agent in episode.agents)
+        )
+        return self._make_appearance(episode.key, models, sizes, route_signals(self.graph, route), route.xy)
 
     def appearance_of_trace(self, trace: EpisodeTrace) -> Appearance:
         """Return the appearance of the episode of a trace of this town."""
-        return self._make_appearance(trace.key, trace.models, trace.signal_ids, trace.route)
+        sizes: tuple[tuple[float, ...], ...] = ((),) * len(trace.models)
+        if trace.heights:
+            sizes = tuple(map(stated_size, trace.models, trace_sizes(trace)))
+        return self._make_appearance(trace.key, trace.models, sizes, trace.signal_ids, trace.route)
 
-    def _make_appearance(self, key: str, models: tuple[str, ...], signals: I32, way: F32) -> Appearance:
+    def _make_appearance(
+        self, key: str, models: tuple[str, ...], sizes: tuple[tuple[float, ...], ...], signals: I32, way: F32
+    ) -> Appearance:
         agents = range(len(models))
         strides = np.array([generator("stride", key, agent).uniform(0, STRIDE) for agent in agents])
         near_signs = [
@@ -224,6 +236,7 @@ class EpisodeScene:
         return Appearance(
             key,
             models,
+            sizes,
             tuple(int(generator("variant", key, agent).integers(VARIANTS)) for agent in agents),
             tuple(draw_paint(generator("paint", key, agent)) for agent in agents),
             strides,
@@ -248,7 +261,7 @@ class EpisodeScene:
                 phase = 0
                 if _cycles(model):
                     phase = int((agent_poses.walked[agent] + appearance.strides[agent]) / STRIDE * PHASES) % PHASES
-                body_index = self._bodies[model, appearance.variants[agent], phase]
+                body_index = self._bodies[model, appearance.variants[agent], phase, appearance.sizes[agent]]
                 visible.append(SceneObject(body_index, poses[agent], appearance.paints[agent], agent + 1))
         return tuple(visible)
 

@@ -33,7 +33,7 @@ from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.sensor import SensorModel as Response
 from ssad.rendering.episode_scene import AgentPoses, Appearance, EpisodeScene, agent_poses, walked_distance
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, agent_size
 
 DAY: Final = SceneWeather(0.9, 2.2, 0.3)
 AT_ONCE, AT_ONCE_GPU, AT_LEAST_GPU = 1, 192, 16  # views rendered in one call; on a CPU more do not pay
@@ -204,14 +204,14 @@ class Onboard:
         """Add the bodies of an episode to its town."""
         town.add_bodies(appearance.bodies())
         if self.attack is not None:
-            town.add_meshes(self.attack.meshes(self.attack.attacked_model(appearance.models, appearance.key)))
+            town.add_meshes(self.attack.meshes(*self._attacked(appearance)))
 
     def visible_objects(self, sight: AgentView) -> tuple[SceneObject, ...]:
         """The bodies that an agent could see."""
         scene_objects = sight.town.objects(sight.appearance, sight.moment, without=sight.agent)
         if self.attack is None:
             return scene_objects
-        (target_key, *_) = self.attack.meshes(self._attacked(sight))
+        (target_key, *_) = self.attack.meshes(*self._attacked(sight.appearance))
         return self.attack.replace_attacked(scene_objects, sight.town.index(target_key), sight.town.stop_signs)
 
     def render(self, sights: Sequence[AgentView], cameras: Sequence[Camera]) -> Rendering:
@@ -229,11 +229,13 @@ class Onboard:
 
     def edit(self, sight: AgentView) -> SceneEdit | None:
         """Return the edit of an episode, the same for all episodes whose attacked agent is of one model."""
-        return None if self.attack is None else self.attack.body(self._attacked(sight))[1]
+        return None if self.attack is None else self.attack.body(*self._attacked(sight.appearance))[1]
 
-    def _attacked(self, sight: AgentView) -> str:
+    def _attacked(self, appearance: Appearance) -> tuple[str, tuple[float, ...]]:
+        """Return the model and the size of the attacked agent, as `AgentEdit.body` takes them."""
         assert self.attack is not None
-        return self.attack.attacked_model(sight.appearance.models, sight.appearance.key)
+        model = self.attack.attacked_model(appearance.models, appearance.key)
+        return model, self.attack.attacked_size(appearance.sizes)
 
     def agent_views(self, simulator: Simulator, agents: I32) -> list[AgentView]:
         """Return the current views of agents [N, 2] (scene, agent), without those whose episode has ended."""
@@ -293,7 +295,8 @@ class Onboard:
                 object_cache[id(sight)] = scene_objects
         lit_lenses = sight.town.lights(appearance, moment, camera_pose[:2, 3])
         model_entry = MODELS[appearance.models[agent]]
-        nose_pose = sight.pose @ upright_pose(0.5 * model_entry.length - NOSE, 0.0, 0.0)
+        length, _, _ = agent_size(model_entry.name, appearance.sizes[agent])
+        nose_pose = sight.pose @ upright_pose(0.5 * length - NOSE, 0.0, 0.0)
         lamps = own_lamps(nose_pose, weather) if model_entry.kind in WITH_LAMPS else ()
         # The noise depends on nothing else, so a trace reproduces the reading to the bit.
         noise_seed = int(digest("onboard noise", appearance.key, moment.step, agent, camera.channel)[:7], 16)
@@ -301,7 +304,7 @@ class Onboard:
         edit = self.edit(sight)
         if edit is None or self.attack is None:
             return view
-        _, *cards = self.attack.meshes(self._attacked(sight))
+        _, *cards = self.attack.meshes(*self._attacked(sight.appearance))
         for tag in self.attack.tags(scene_objects):
             view = edit.on(view, tag, cards=[sight.town.index(key) for key in cards])
         return view

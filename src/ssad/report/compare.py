@@ -23,7 +23,7 @@ from ssad.metrics import (
     sign_flip_test,
 )
 from ssad.metrics.intervals import MIN_ROUTES
-from ssad.report.load import Run, load_run
+from ssad.report.load import Run, load_run, read_as_kind
 from ssad.report.pages import render
 from ssad.report.tables import METHODS, Table, TableCell, TableRow, write_tables
 
@@ -149,7 +149,8 @@ def compare_runs(folders: Sequence[Path], pairs: Sequence[str] = ()) -> list[Com
     if len(folders) == 1 and pairs:
         run = load_run(folders[0])
         label = folders[0].resolve().name
-        return [_compare(ComparedRun(label, run), ComparedRun(label, run), 1, pairs)]
+        with read_as_kind(run):
+            return [_compare(ComparedRun(label, run), ComparedRun(label, run), 1, pairs)]
     if len(folders) < 2:
         raise ConfigError(
             "compare needs two results folders, such as: ssad compare runs/a runs/b; "
@@ -161,7 +162,11 @@ def compare_runs(folders: Sequence[Path], pairs: Sequence[str] = ()) -> list[Com
         if compared_run.run.kind != runs[0].run.kind:
             kinds = f"{runs[0].run.kind} and {compared_run.run.kind}"
             raise ConfigError(f"{compared_run.run.folder}: runs of different kinds cannot be compared ({kinds})")
-    return [_compare(runs[0], compared_run, number, pairs) for number, compared_run in enumerate(runs[1:], 1)]
+    comparisons = []
+    for number, compared_run in enumerate(runs[1:], 1):
+        with read_as_kind(runs[0].run, compared_run.run):
+            comparisons.append(_compare(runs[0], compared_run, number, pairs))
+    return comparisons
 
 
 def write_comparison(folders: Sequence[Path], out: Path, pairs: Sequence[str] = ()) -> tuple[Path, list[Comparison]]:
@@ -181,7 +186,9 @@ def write_comparison(folders: Sequence[Path], out: Path, pairs: Sequence[str] = 
     """
     comparisons = compare_runs(folders, pairs)
     safeio.make_folder(out)
-    write_tables(out, [table for comparison in comparisons for table in (comparison.table, comparison.groups) if table])
+    tables = [table for comparison in comparisons for table in (comparison.table, comparison.groups) if table]
+    with read_as_kind(*(comparison.second.run for comparison in comparisons)):
+        write_tables(out, tables)
     path = out / "compare.html"
     replays = [
         {
@@ -192,9 +199,9 @@ def write_comparison(folders: Sequence[Path], out: Path, pairs: Sequence[str] = 
         for comparison in comparisons
         for replay_pair in comparison.replays[:MAX_REPLAYS]
     ]
-    safeio.write_atomic(
-        path, render("compare.html", comparisons[0].first.run, comparisons=comparisons, replays=replays)
-    )
+    with read_as_kind(comparisons[0].first.run):
+        page = render("compare.html", comparisons[0].first.run, comparisons=comparisons, replays=replays)
+    safeio.write_atomic(path, page)
     return path, comparisons
 
 

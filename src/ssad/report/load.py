@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shlex
 import textwrap
+import traceback
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -166,6 +168,7 @@ def load_run(folder: Path | str) -> Run:
     check_tree(folder)
     header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
     _check_header(folder / "run.json", header)
+    header = {name: value for name, value in header.items() if value is not None}
     records = read_records(folder, header)
     if not records.results:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
@@ -179,3 +182,21 @@ def load_run(folder: Path | str) -> Run:
     lines = sorted(records.results, key=lambda line: positions.get(line["key"], len(positions)))
     planned = max(len(positions), len(lines))
     return Run(folder, header, tuple(lines), records.episodes, planned, sealed=records.sealed)
+
+
+@contextlib.contextmanager
+def read_as_kind(*runs: Run) -> Iterator[None]:
+    """Make an error of a page that is made of runs' records one line: the records may come from anywhere.
+
+    Raises:
+        StoreError: The records are not those of the kind. Its cause is the error, for authors of kinds.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise StoreError(
+            f"{' or '.join(str(run.folder) for run in runs)}: its records are not those of kind {runs[0].kind}: "
+            f"{type(error).__name__}: {error} "
+            f"({Path(place.filename).name}:{place.lineno}); run the suite again"
+        ) from error

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import lru_cache
+
+import numpy as np
 
 from ssad.core.errors import unknown_name
-from ssad.core.types import AgentKind, Model
+from ssad.core.types import DEFAULT_FRICTION, AgentKind, Body, EpisodeAgent, EpisodeTrace, Model
 
 # CARLA's cars turn their front wheels by up to 70 degrees at steer = 1; ported controllers rely on that scale.
 _STEER = math.radians(70.0)
 # Yaw rate is cut so that the lateral acceleration stays below this (dry road, before sliding), m/s^2.
 GRIP = 7.0
+GRAVITY = 9.81  # m/s^2
 # The front wheels need this long from straight to full lock, s.
 STEER_TIME = 0.5
 # Reverse gear: top speed, m/s.
@@ -53,3 +59,82 @@ def model(name: str) -> Model:
         return MODELS[name]
     except KeyError:
         raise unknown_name("model", name, MODELS) from None
+
+
+def agent_model(agent: EpisodeAgent, models: Mapping[str, Model] = MODELS) -> Model:
+    """Return the model of an agent with the dimensions and limits that its body states.
+
+    Args:
+        agent: The agent.
+        models: Models by name.
+
+    Raises:
+        UnknownNameError: There is no such model.
+    """
+    if agent.model not in models:
+        raise unknown_name("model", agent.model, models)
+    return model_with_body(models[agent.model], agent.body)
+
+
+@lru_cache(maxsize=1024)
+def model_with_body(base: Model, body: Body) -> Model:
+    """Return a model with the dimensions and limits of a body; the wheelbase keeps its share of the length."""
+    stated = {name: value for name, value in asdict(body).items() if value is not None}
+    if "length" in stated:
+        stated.setdefault("wheelbase", base.wheelbase * stated["length"] / base.length)
+    return replace(base, **stated) if stated else base
+
+
+def acceleration_limits(agent: EpisodeAgent, friction: float) -> tuple[float, float]:
+    """Return the maximum acceleration and deceleration of an agent on a surface, m/s^2."""
+    limits = agent_model(agent)
+    return min(limits.max_accel, friction * GRAVITY), min(limits.max_brake, friction * GRAVITY)
+
+
+def lateral_grip(friction: float) -> float:
+    """Return the maximum lateral acceleration of a vehicle on a surface, m/s^2."""
+    return GRIP * (friction / DEFAULT_FRICTION)
+
+
+def stated_size(name: str, size: tuple[float, float, float]) -> tuple[float, ...]:
+    """Return the size of an agent, m, in single precision, or () if it is that of its model.
+
+    Args:
+        name: Name of the model.
+        size: Length, width, height, m.
+
+    Returns:
+        Values that are the same for an episode and for its trace.
+    """
+    base = MODELS.get(name)
+    rounded = tuple(float(np.float32(value)) for value in size)
+    if base is not None and rounded == tuple(
+        float(np.float32(value)) for value in (base.length, base.width, base.height)
+    ):
+        return ()
+    return rounded
+
+
+def agent_size(name: str, size: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return length, width and height of an agent, m.
+
+    Args:
+        name: Name of its model.
+        size: What `stated_size` returns.
+
+    Raises:
+        KeyError: There is no such model.
+    """
+    if size:
+        length, width, height = size
+        return length, width, height
+    base = MODELS[name]
+    return base.length, base.width, base.height
+
+
+def trace_sizes(trace: EpisodeTrace) -> tuple[tuple[float, float, float], ...]:
+    """Return length, width and height of each agent of a trace, m."""
+    if not trace.heights:
+        return tuple((m.length, m.width, m.height) for m in (model(name) for name in trace.models))
+    lengths, widths = trace.length.tolist(), trace.width.tolist()
+    return tuple(zip(lengths, widths, trace.heights, strict=True))

@@ -29,7 +29,8 @@ from ssad.core.driving import (
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import ENDS, F32, I32, AgentKind, Bool, Controller, End, EpisodeTrace, Route
+from ssad.core.types import ENDS, F32, I32, AgentKind, Bool, Controller, End, Episode, EpisodeTrace, Route
+from ssad.world.models import agent_model
 from ssad.world.observation import observe
 from ssad.world.sensors import SENSORS
 
@@ -466,6 +467,14 @@ def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: in
         signal_ids=signal_ids,
         route=route.xy,
         end=ENDS[int(simulator.ended()[b])] or "max_steps",
+        heights=_heights(episode),
         **agent_fields,
         **ego_fields,
     )
+
+
+def _heights(episode: Episode) -> tuple[float, ...]:
+    """Return the heights of the agents, m; () if no agent states dimensions of its own."""
+    if not any(agent.body.length or agent.body.width or agent.body.height for agent in episode.agents):
+        return ()
+    return tuple(float(np.float32(agent_model(agent).height)) for agent in episode.agents)

@@ -17,8 +17,8 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.tensor_boxes import rectangle_corners, rotate
-from ssad.core.types import AgentKind, LaneType
-from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE, model
+from ssad.core.types import DEFAULT_FRICTION, AgentKind, LaneType, Model
+from ssad.world.models import GRAVITY, REVERSE_SPEED, STEER_TIME, WALKER_RATE, lateral_grip, model
 from ssad.world.roads.query import DRIVABLE, LaneQuery
 
 SUBSTEPS = 2  # of a step, as in the world
@@ -35,6 +35,7 @@ class Bodies(NamedTuple):
         max_steer: Angle of the front wheels at steer = 1, rad.
         max_accel, max_brake: m/s^2.
         max_speed: m/s; 0 for objects that cannot move by themselves.
+        traction, grip: Accelerations that the surface allows along the heading and across it, m/s^2.
     """
 
     walker: Tensor
@@ -45,6 +46,8 @@ class Bodies(NamedTuple):
     max_accel: Tensor
     max_brake: Tensor
     max_speed: Tensor
+    traction: Tensor
+    grip: Tensor
 
 
 class MotionState(NamedTuple):
@@ -61,18 +64,26 @@ class MotionState(NamedTuple):
     wheel: Tensor
 
 
-def bodies_of(models: Sequence[str], *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Bodies:
-    """Return the bodies [A] of models by name (see `ssad.world.models.MODELS`).
+def bodies_of(
+    models: Sequence[str | Model],
+    *,
+    friction: float | Sequence[float] = DEFAULT_FRICTION,
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+) -> Bodies:
+    """Return the bodies [A] of models (see `ssad.world.models.MODELS`). Their brakes act at once.
 
     Args:
-        models: Names.
+        models: Models, or their names.
+        friction: Coefficient of friction of the surface, or of the surface under each of them.
         dtype: Floating-point type.
         device: Torch device.
 
     Raises:
         UnknownNameError: There is no such model.
     """
-    bodies = [model(name) for name in models]
+    bodies = [model(entry) if isinstance(entry, str) else entry for entry in models]
+    frictions = [friction] * len(bodies) if isinstance(friction, float) else list(friction)
 
     def column(values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -86,6 +97,8 @@ def bodies_of(models: Sequence[str], *, dtype: torch.dtype = torch.float32, devi
         column([body.max_accel for body in bodies]),
         column([body.max_brake for body in bodies]),
         column([body.max_speed for body in bodies]),
+        column([GRAVITY * value for value in frictions]),
+        column([lateral_grip(value) for value in frictions]),
     )
 
 
@@ -229,15 +242,17 @@ def _drive(state: MotionState, controls: Tensor, bodies: Bodies, substep: float,
     controls = controls.repeat_interleave(substeps, 0) if substeps > 1 else controls
     throttle, brake = controls[..., 0].clamp(0.0, 1.0), controls[..., 1].clamp(0.0, 1.0)
     movable = bodies.max_speed > 0.0
-    speed_gain = torch.where(controls[..., 3] > 0.5, -throttle, throttle) * bodies.max_accel * substep
-    speed = _speeds(state.speed, torch.where(movable, speed_gain, 0.0), brake * bodies.max_brake * substep, bodies)
+    push = torch.minimum(throttle * bodies.max_accel, bodies.traction)
+    speed_gain = torch.where(controls[..., 3] > 0.5, -push, push) * substep
+    drag = torch.minimum(brake * bodies.max_brake, bodies.traction) * substep
+    speed = _speeds(state.speed, torch.where(movable, speed_gain, 0.0), drag, bodies)
     # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
     turning = movable & ((controls[..., 0] > 0.0) | (speed[:-1:substeps] != 0.0).repeat_interleave(substeps, 0))
     target_wheel = controls[..., 2].clamp(-1.0, 1.0) * bodies.max_steer
     wheel = _wheels(state.wheel, target_wheel, bodies.max_steer * (substep / STEER_TIME), turning)
     mean_speed = torch.where(movable, 0.5 * (speed[:-1] + speed[1:]), 0.0)
     slip = torch.atan(0.5 * torch.tan(wheel[1:]))
-    max_rate = GRIP / mean_speed.abs().clamp_min(1e-3)
+    max_rate = bodies.grip / mean_speed.abs().clamp_min(1e-3)
     yaw_rate = mean_speed * torch.sin(slip) * 2.0 / bodies.wheelbase
     yaw_rate = torch.minimum(torch.maximum(yaw_rate, -max_rate), max_rate)
     x, y, yaw = state.pose.unbind(-1)

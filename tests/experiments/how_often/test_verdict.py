@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from pathlib import Path
 
-from ssad.experiments.how_often.verdict import _million
+import pytest
+from helpers.run_folder import write_run
+
+from ssad.experiments.how_often.verdict import _million, without_interval
+from ssad.report.load import load_run
 
 
 @pytest.mark.parametrize(
@@ -12,3 +16,13 @@ from ssad.experiments.how_often.verdict import _million
 )
 def test_small_numbers_have_two_digits_and_large_ones_none_behind_the_point(value: float, text: str) -> None:
     assert _million(value) == text
+
+
+@pytest.mark.parametrize(("high", "remarks"), [(None, 1), (50.0, 0)])
+def test_the_table_says_why_splitting_has_no_limits(high: float | None, remarks: int, tmp_path: Path) -> None:
+    metrics = {"per_million": 10.0, "low": None if high is None else 1.0, "high": high}
+    line = {"key": "a", "system": "autopilot", "method": "splitting", "status": "ok", "metrics": metrics}
+    run = load_run(write_run(tmp_path / "run", {"kind": "how-often"}, [line]))
+    sentences = without_interval(run)
+    assert len(sentences) == remarks
+    assert all("repeats=8 or more" in sentence for sentence in sentences)

@@ -11,6 +11,7 @@ import pytest
 from ssad.core.errors import ConfigError, RouteError
 from ssad.core.types import (
     Actor,
+    Body,
     Controller,
     EpisodeLimits,
     Pose,
@@ -43,6 +44,19 @@ def test_nobody_stands_in_the_ego_at_the_start() -> None:
     for scenario in (with_car(nearest - 0.1), with_car(0.0), with_car(0.0, body.width - 0.1)):
         with pytest.raises(RouteError, match="scenario Mine: van stands in the ego at the start; move one of them"):
             build_episode(scenario, town, seed=0)
+
+
+def test_bodies_and_friction_of_a_scenario_are_those_of_its_episode() -> None:
+    town, long_body = load_town("ProvingGround"), Body(length=9.0)
+    wide = replace(PLAIN, ego_model="suv", ego_body=Body(max_brake=6.0), friction=0.4)
+    episode = build_episode(replace(wide, actors=(replace(with_car(20.0).actors[0], body=long_body),)), town, seed=0)
+    assert (episode.agents[0].model, episode.agents[0].body) == ("suv", Body(max_brake=6.0))
+    assert (episode.agents[1].body, episode.friction) == (long_body, 0.4)
+    assert build_episode(wide, town, seed=0).key != build_episode(replace(wide, friction=0.5), town, seed=0).key
+    near = build_episode(PLAIN, town, seed=0).agents[0].pose.x - START.x + 0.5 * model("car").length + 3.0
+    assert len(build_episode(with_car(near), town, seed=0).agents) == 2
+    with pytest.raises(RouteError, match="van stands in the ego"):
+        build_episode(replace(PLAIN, actors=(replace(with_car(near).actors[0], body=long_body),)), town, seed=0)
 
 
 def test_the_one_that_stands_there_is_named() -> None:

@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError, RouteError
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import Actor, Episode, Phase, PhaseTrigger, Pose, Route, Scenario
+from ssad.core.types import Actor, Body, Episode, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic import (
     PRECRASH,
     Parameter,
@@ -79,7 +79,13 @@ NOMINAL = {
 
 
 # fields that came later: at their defaults they change nothing
-LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None}
+LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None, "lateral": (), "lateral_targets": ()}
+LATER |= {"acceleration": None, "jerk": None, "shape": "linear", "duration": None, "distance": None, "arrival": None}
+LATER |= {"name": "", "reference": "", "factor": False, "continuous": False, "anytime": False, "agent": "", "phase": ""}
+LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_space": False, "measure": "straight"}
+LATER |= {"all": (), "any": ()}
+LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
+LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 
@@ -397,6 +403,12 @@ def test_answers_are_kept_by_map_and_route(crossroads: LaneGraph, routes: Any) -
     assert len(calls) == 6
     with pytest.raises(TypeError, match="by position"):
         ask(crossroads, routes.left, number=1)
+
+
+@pytest.mark.parametrize("length", [0.5, 100_001.0, 1e300])
+def test_a_path_of_an_actor_has_a_plausible_length(length: float) -> None:
+    with pytest.raises(RouteError, match=r"too short|too long"):
+        polyline_route(np.array([[0.0, 0.0], [length, 0.0]]))
 
 
 def test_the_trigger_is_found_on_the_route_that_is_asked_about() -> None:

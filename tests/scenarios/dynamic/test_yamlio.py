@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import (
     Actor,
+    Body,
     EpisodeLimits,
+    LateralPhase,
     Phase,
     PhaseTrigger,
     Pose,
@@ -39,6 +41,7 @@ from ssad.world.models import MODELS
 
 number = st.floats(-1.0e5, 1.0e5, allow_subnormal=False)
 positive = st.floats(1e-3, 1.0e4)
+jerks = st.floats(1e-3, 100.0)
 poses = st.builds(Pose, number, number, number)
 light = st.sampled_from(["program", "off", "red", "green"])
 texts = st.text(max_size=20).filter(lambda t: all(c.isprintable() for c in t))
@@ -55,10 +58,21 @@ def scenarios(draw: st.DrawFn) -> Scenario:
             positive,
             st.just(0),
         )
-        phase = st.builds(Phase, st.floats(0.0, 1.0).map(float), condition)
+        groups = st.lists(condition | st.builds(PhaseTrigger, all=st.tuples(condition, condition)), max_size=3).map(
+            tuple
+        )
+        paced = st.fixed_dictionaries({}, optional={"acceleration": positive.map(lambda a: min(a, 9.0)), "jerk": jerks})
+        phase = st.tuples(st.builds(Phase, st.floats(0.0, 1.0).map(float), condition), paced).map(
+            lambda pair: replace(pair[0], **pair[1])
+        )
         body = st.sampled_from([m for m in MODELS if MODELS[m].max_speed >= 1.0])
         path = st.lists(st.tuples(number, number), min_size=2, max_size=4).map(tuple)
-        actor = st.builds(Actor, texts, body, poses, st.lists(phase, max_size=3).map(tuple), path)
+        swerve = st.builds(LateralPhase, st.integers(-3, 3), st.floats(-5.0, 5.0), st.builds(PhaseTrigger, any=groups))
+        size = st.builds(Body, length=st.none() | st.floats(0.5, 20.0), brake_build_up=st.none() | st.floats(0.0, 1.0))
+        phases, lateral = (st.lists(kind, max_size=2).map(tuple) for kind in (phase, swerve))
+        actor = st.builds(
+            Actor, texts, body, poses, phases, path, body=size, speed=st.floats(0.0, 1.0), lateral=lateral
+        )
         actors = tuple(draw(st.lists(actor, min_size=1, max_size=3)))
     box = parameter_box(kind)
     chosen = draw(st.sets(st.sampled_from(sorted(box))))
@@ -79,6 +93,11 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         seed=draw(st.integers(0, 2**40)),
         group=draw(texts),
         source=draw(texts),
+        ego_model=draw(st.sampled_from(["car", "truck"])),
+        ego_body=draw(
+            st.builds(Body, width=st.none() | st.floats(1.0, 3.0), max_brake=st.none() | st.floats(1.0, 9.0))
+        ),
+        friction=draw(st.sampled_from([0.9, 0.3])),
     )
 
 
@@ -161,7 +180,11 @@ BAD: list[tuple[dict[str, Any], int, str]] = [
         'a valid string, not {"long": ["aaaaaaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbbbbbb",...',
     ),
     ({"route": "[{x: 0, y: 0}]"}, 4, "at least two key points"),
-    ({"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"}, 4, 'route[1].x: should be a valid number, not "nine"'),
+    (
+        {"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"},
+        4,
+        "route[1].x: expression 'nine': there is no parameter 'nine'; closest: ",
+    ),
     ({"route": "[{x: 0, y: 0}, {x: '9', y: 0}]"}, 4, "route[1].x: should be a valid number"),
     ({"route": "[{x: 0, y: 0}, {x: 9, y: 0, z: 1}]"}, 4, "route[1].z: unknown key; known: x, y, yaw"),
     ({"route": "[{x: 0, y: 0}, {x: 9}]"}, 4, "key 'y' is missing"),
@@ -376,6 +399,25 @@ BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"placements": [END]}, {"placements": [END, {"x": 0, "y": 1e6}]}, "placements[1]: beyond 100000 m"),
     ({"route": [START, END]}, {"route": [START]}, "route: a route needs at least two key points"),
     (actor(pose={"x": 1e5, "y": 0}), actor(pose={"x": 100001, "y": 0}), "actors[0].pose: beyond 100000 m"),
+    (actor(body={"length": 0.1}), actor(body={"length": 0.09}), "actors[0].body.length: 0.09 is outside 0.1 to 30 m"),
+    (actor(body={"width": 5}), actor(body={"width": 5.01}), "actors[0].body.width: 5.01 is outside 0.1 to 5 m"),
+    (actor(body={"height": 6}), actor(body={"height": 7}), "actors[0].body.height: 7 is outside 0.1 to 6 m"),
+    (actor(body={"max_speed": 5}, phases=[{"speed": 5}]), actor(phases=[{"speed": 5}]), "speed: 5 is outside 0 to 4"),
+    (actor(body={}), actor(body={"size": 3}), "body.size: unknown key; known: length, width, height, wheelbase"),
+    (
+        {"ego_body": {"brake_build_up": 0}},
+        {"ego_body": {"brake_build_up": -1}},
+        "brake_build_up: -1 is outside",
+    ),
+    (
+        {"ego_body": {"max_brake": 9.5}},
+        {"ego_body": {"max_brake": 0}},
+        "max_brake: 0 is outside 0.1 to 30 m/s^2",
+    ),
+    ({"ego_model": "suv"}, {"ego_model": "suw"}, "ego_model: unknown model 'suw'"),
+    ({"ego_model": "truck"}, {"ego_model": "walker"}, "ego_model: walker is no vehicle, which the ego must be"),
+    ({"friction": 0.05}, {"friction": 0.04}, "friction: 0.04 is outside 0.05 to 1.5"),
+    ({"friction": 1.5}, {"friction": 1.51}, "friction: 1.51 is outside 0.05 to 1.5"),
     (actor(path=[[0, 0], [1, 0]]), actor(path=[[0, 0]]), "actors[0].path: a path needs at least two points"),
     (actor(phases=[{"speed": 4}]), actor(phases=[{"speed": 4.01}]), "phases[0].speed: 4.01 is outside 0 to 4 m/s"),
     (actor(phases=[{"speed": 0}]), actor(phases=[{"speed": -0.01}]), "phases[0].speed: -0.01 is outside 0 to 4 m/s"),
@@ -383,7 +425,7 @@ BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (waiting(actor=0), waiting(actor=1), "phases[0].when.actor: there are actors 0 to 0"),
     (waiting(actor=0), waiting(actor=-1), "phases[0].when.actor: there are actors 0 to 0"),
     ({"type": "Custom"}, {"type": "Nothing"}, "type: "),
-    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+/"),
+    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+=/"),
     ({"parameters": {"speed": 17}}, {"parameters": {"speed": 17.01}}, "parameters.speed: 17.01 is outside 7 to 17 m/s"),
     (actor(), actor() | {"type": "RightTurn"}, "actors: only type Custom takes actors; RightTurn makes its own"),
 ]

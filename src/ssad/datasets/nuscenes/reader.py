@@ -7,6 +7,7 @@ scene. Scenes are objects of `ssad.datasets.nuscenes.scene`; `ssad.datasets.nusc
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -42,7 +43,7 @@ from ssad.datasets.nuscenes.schema import (
     Sensor,
     TableRecord,
 )
-from ssad.datasets.nuscenes.tables import table_path
+from ssad.datasets.nuscenes.tables import nuscenes_path, table_path
 
 R = TypeVar("R", bound=TableRecord)
 
@@ -57,12 +58,14 @@ class NuScenes:
     Raises:
         ConfigError: The version does not exist, or several exist and none is named.
         FormatError: The tables are broken.
-        StoreError: The index of a large version cannot be written.
+        StoreError: A folder or a table leads out of the root (`ssad.core.folders.data_path`), or the index of a large
+            version cannot be written.
     """
 
     def __init__(self, root: Path, version: str | None = None) -> None:
         self.root = Path(root)
         self.version = _choose_version(self.root, version)
+        _check_links(self.root)
         self._index: Index = open_index(self.root, self.version)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -308,6 +311,17 @@ class NuScenes:
             token = rows[int(zero_rows[0])].token
             raise FormatError(f"{self._path(SampleAnnotation)}: '{token}': the rotation has length zero")
         return rotation
+
+
+def _check_links(root: Path) -> None:
+    """Raise StoreError if a folder of sensors leads out of the root: before any of its files is read."""
+    for name in ("samples", "sweeps"):
+        folder = nuscenes_path(root, name)
+        if folder.is_dir():
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.is_symlink():
+                        nuscenes_path(root, f"{name}/{entry.name}")
 
 
 def _choose_version(root: Path, version: str | None) -> str:

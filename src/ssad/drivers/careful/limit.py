@@ -19,7 +19,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, Bool, Episode
 from ssad.drivers.careful.sight import Path
 from ssad.drivers.careful.steering import pursue
-from ssad.world.models import GRIP, model
+from ssad.world.models import GRIP, agent_model
 from ssad.world.world import World
 
 MOMENTS = 8  # start times, evenly between the start of the danger and the contact
@@ -87,7 +87,7 @@ class Evasions:
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Prepare for new episodes."""
-        bodies = [model(episode.agents[0].model) for episode in episodes]
+        bodies = [agent_model(episode.agents[0]) for episode in episodes]
         self.power = np.array([(body.max_accel, body.max_brake) for body in bodies])
         self.wheel = np.array([(body.wheelbase, body.max_steer) for body in bodies])
         self.begun[:] = np.nan
@@ -168,7 +168,7 @@ def wrong_side(episode: Episode, graph: LaneGraph) -> Bool:
 
 def manoeuvres(episode: Episode, start: float, contact: float) -> list[Manoeuvre]:
     """Return all combinations of start times from `start` to the contact, accelerations and offsets."""
-    body = model(episode.agents[0].model)
+    body = agent_model(episode.agents[0])
     accelerations = [
         0.0,
         *(-brake_share * min(body.max_brake, GRIP + 1.0) for brake_share in BRAKES),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -19,7 +18,7 @@ from ssad.core.traces import save_trace
 from ssad.core.types import EpisodeTrace, Scenario
 from ssad.engine.kind import Cell, Column, Job, Names, Plan
 from ssad.experiments.how_often.failure_rate import METHODS, ChanceEpisode, Method, first_obstacle
-from ssad.experiments.how_often.verdict import contradictions, unbranched, verdict
+from ssad.experiments.how_often.verdict import contradictions, unbranched, verdict, without_interval
 from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, describe_scenarios
 from ssad.report import default
 from ssad.report.load import Run
@@ -102,7 +101,7 @@ class HowOften(ScenarioKind):
             ConfigError: The input is wrong, or every cell has a method that needs branches and a system without.
         """
         systems = {name: system_version(name) for name in suite.systems}
-        scenarios, towns = describe_scenarios(suite)
+        scenarios, towns = describe_scenarios(suite, [column.name for column in self.columns])
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
         cells = tuple(
             self.scenario_cell(
@@ -156,9 +155,11 @@ class HowOften(ScenarioKind):
         return verdict(run)
 
     def summary(self, run: Run) -> Table:
-        """Return the main table; its note says which methods contradict each other, and which systems lack some."""
-        # A terminal cuts what is wider than itself, and the table may be.
-        notes = [textwrap.fill(sentence, 78) for sentence in (*contradictions(run), *unbranched(run))]
+        """Return the main table.
+
+        Its note says which methods contradict each other, which systems lack some, and why limits are missing.
+        """
+        notes = [*contradictions(run), *unbranched(run), *without_interval(run)]
         return replace(default.summary(run), note="\n".join(notes))
 
 

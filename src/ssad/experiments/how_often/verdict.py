@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from itertools import combinations
 
+from ssad.metrics.intervals import MIN_DIFFERENT
 from ssad.report.load import Run
 from ssad.report.records import Line, metric_of
 from ssad.report.verdict import lines_by
@@ -51,6 +52,16 @@ def unbranched(run: Run) -> list[str]:
             )
             sentences.append(f"{system} is measured by plain Monte Carlo alone: {obstacle}{gain}.")
     return sentences
+
+
+def without_interval(run: Run) -> list[str]:
+    """Return why estimates by splitting have no limits, in a sentence; none if all have some."""
+    if not any(line.get("status") == "ok" and math.isnan(metric_of(line, "high")) for line in run.lines):
+        return []
+    return [
+        f"Limits need {MIN_DIFFERENT} repeats of splitting with unlike estimates: set repeats={MIN_DIFFERENT} or more, "
+        "and more particles where repeats end alike."
+    ]
 
 
 def _cases(run: Run) -> Iterator[tuple[str, str, list[Line]]]:

@@ -44,16 +44,23 @@ def freeze_episode(episode: Episode, trace: EpisodeTrace, *, name: str | None = 
     end_time = float(episode.limits.max_steps * trace.dt)
     actors = []
     for agent_index in range(1, len(trace.names)):
+        body = episode.agents[agent_index].body
         rows = _agent_rows(trace, agent_index)
         if rows is None:
             continue
         if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MIN_MOTION and bool(trace.active[:, agent_index].all()):
             # an actor without phases and trajectory stands still
-            actors.append(Actor(trace.names[agent_index], trace.models[agent_index], agent_pose(rows[0])))
+            actors.append(Actor(trace.names[agent_index], trace.models[agent_index], agent_pose(rows[0]), body=body))
             continue
         trajectory = round_rows(extend_by_stop(rows, end_time) if trace.active[-1, agent_index] else rows)
         actors.append(
-            Actor(trace.names[agent_index], trace.models[agent_index], Pose(*trajectory[0][1:]), trajectory=trajectory)
+            Actor(
+                trace.names[agent_index],
+                trace.models[agent_index],
+                Pose(*trajectory[0][1:]),
+                trajectory=trajectory,
+                body=body,
+            )
         )
     return replace(
         base,
@@ -65,6 +72,9 @@ def freeze_episode(episode: Episode, trace: EpisodeTrace, *, name: str | None = 
         actors=tuple(actors),
         traffic=None,
         source=f"{base.name}, seed {episode.seed}",
+        declared={},
+        expressions={},
+        constraints=(),
     )
 
 
@@ -81,7 +91,9 @@ def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
     return replace(
         scenario,
         actors=tuple(
-            replace(actor, pose=pose, phases=(), path=(), trajectory=trajectory) if actor.name == name else actor
+            replace(actor, pose=pose, phases=(), path=(), trajectory=trajectory, lateral=(), speed=0.0)
+            if actor.name == name
+            else actor
             for actor in scenario.actors
         ),
     )

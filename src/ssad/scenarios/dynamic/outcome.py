@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from ssad.core.generators import Outcome, Proposal
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import F64, AgentKind, EpisodeTrace
+from ssad.core.types import F64, AgentKind, Body, EpisodeTrace, Model
 from ssad.metrics.criticality import trace_boxes
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
-from ssad.world.models import GRIP, model
+from ssad.world.models import GRIP, model, model_with_body
 from ssad.world.roads.query import LaneQuery
 
 WINDOW = 0.5  # s over which accelerations and jerks are means
@@ -47,9 +47,13 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         contact_time, ego_speed = row * float(trace.dt), abs(float(trace.speed[row, 0]))
         impact_speed = _closing_speed(trace, row, int(trace.contact_agent[row]))
     motor_vehicles = [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.MOTORCYCLE]
-    acceleration, jerk, within_limits = _peak_effort(
-        trace, [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.BICYCLE]
-    )
+    stated_bodies = {actor.name: actor.body for actor in proposal.scenario.actors}
+    models = {
+        agent: model_with_body(model(trace.models[agent]), stated_bodies.get(trace.names[agent], Body()))
+        for agent in agent_indices
+        if trace.kind[agent] <= AgentKind.BICYCLE
+    }
+    acceleration, jerk, within_limits = _peak_effort(trace, models)
     return Outcome(
         proposal,
         trace=trace,
@@ -113,18 +117,17 @@ def _hits_others(trace: EpisodeTrace, box: F64, agent: int) -> bool:
     return False
 
 
-def _peak_effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | None, float | None, bool | None]:
+def _peak_effort(trace: EpisodeTrace, models: Mapping[int, Model]) -> tuple[float | None, float | None, bool | None]:
     """Return the largest acceleration m/s^2 and jerk m/s^3 of vehicles, and whether all respected their limits."""
     lag = max(1, round(WINDOW / trace.dt))
     max_acceleration, max_jerk, within_limits = 0.0, 0.0, True
     efforts = False
-    for agent in agents:
+    for agent, body in models.items():
         present_rows = np.flatnonzero(trace.active[:, agent])
         speed = trace.speed[present_rows, agent].astype(np.float64)
         if len(speed) <= lag:
             continue
         efforts = True
-        body = model(trace.models[agent])
         longitudinal = (speed[lag:] - speed[:-lag]) / (lag * trace.dt)
         yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[present_rows, agent].astype(np.float64)))) / trace.dt
         lateral = np.abs(np.convolve(speed[1:] * yaw_rate, np.ones(lag) / lag, mode="valid"))

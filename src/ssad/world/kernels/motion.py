@@ -3,12 +3,11 @@
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, State
+from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, ScriptState, State
 from ssad.world.kernels.shared import lane_under, on_track, row, sign_line, track_at, wrap
-from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
+from ssad.world.models import REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
-vec5 = wp.types.vector(length=5, dtype=wp.float32)
-GRIP_LIMIT = wp.constant(GRIP)
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
 STEER_SECONDS = wp.constant(STEER_TIME)
 REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
 STOPPED = wp.constant(0.3)  # m/s: slower, a vehicle has stopped
@@ -21,16 +20,19 @@ def bicycle(
     pose: wp.vec3,
     speed: float,
     wheel: float,
+    braking: float,
     control: wp.vec4,
     body: wp.vec4,
     power: wp.vec4,
+    surface: wp.vec3,
     dt: float,
     n: int,
-) -> vec5:
-    """`n` sub-steps of the kinematic bicycle about the box centre (rear share 1/2): x, y, yaw, speed, wheel.
+) -> vec6:
+    """`n` sub-steps of the kinematic bicycle about the box centre (rear share 1/2): x, y, yaw, speed, wheel, braking.
 
-    Throttle gives up to power[0], brake up to power[1] against the motion; the wheel turns at its limited rate to
-    steer * body[3]; yaw rate is cut at lateral acceleration GRIP_LIMIT.
+    Throttle gives up to power[0], brake up to power[1] against the motion, neither more than surface[0]. The brake
+    rises linearly to its demand in power[3] seconds and is released at once. The wheel turns at its limited rate to
+    steer * body[3]; yaw rate is cut at lateral acceleration surface[1].
     """
     substep = dt / float(n)
     x = pose[0]
@@ -38,18 +40,26 @@ def bicycle(
     yaw = pose[2]
     new_speed = speed
     wheel_angle = wheel
+    brake_level = braking
     throttle = wp.clamp(control[0], 0.0, 1.0)
     brake = wp.clamp(control[1], 0.0, 1.0)
     wheel_target = wp.clamp(control[2], -1.0, 1.0) * body[3]
     turn = body[3] * substep / STEER_SECONDS
     for _ in range(n):
         wheel_angle = wheel_angle + wp.clamp(wheel_target - wheel_angle, -turn, turn)
-        acceleration = throttle * power[0]
+        acceleration = wp.min(throttle * power[0], surface[0])
         if control[3] > 0.5:
             acceleration = -acceleration
         before = new_speed
         new_speed = new_speed + acceleration * substep
-        brake_step = brake * power[1] * substep
+        mean_brake = brake
+        if power[3] > 0.0:
+            released = wp.min(brake_level, brake)
+            brake_level = wp.min(released + brake * substep / power[3], brake)
+            mean_brake = 0.5 * (released + brake_level)
+        else:
+            brake_level = brake
+        brake_step = wp.min(mean_brake * power[1], surface[0]) * substep
         if new_speed > 0.0:
             new_speed = wp.max(new_speed - brake_step, 0.0)
         else:
@@ -58,18 +68,19 @@ def bicycle(
         mean_speed = 0.5 * (before + new_speed)
         slip = wp.atan(0.5 * wp.tan(wheel_angle))
         yaw_rate = mean_speed * wp.sin(slip) * 2.0 / body[2]
-        rate_limit = GRIP_LIMIT / wp.max(wp.abs(mean_speed), 1.0e-3)
+        rate_limit = surface[1] / wp.max(wp.abs(mean_speed), 1.0e-3)
         yaw_rate = wp.clamp(yaw_rate, -rate_limit, rate_limit)
         heading = yaw + slip + 0.5 * yaw_rate * substep
         x = x + mean_speed * wp.cos(heading) * substep
         y = y + mean_speed * wp.sin(heading) * substep
         yaw = yaw + yaw_rate * substep
-    result = vec5()
+    result = vec6()
     result[0] = x
     result[1] = y
     result[2] = wrap(yaw)
     result[3] = new_speed
     result[4] = wheel_angle
+    result[5] = brake_level
     return result
 
 
@@ -78,6 +89,7 @@ def move_one(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
+    script: ScriptState,
     action: wp.array2d(dtype=wp.vec4),
     place: wp.array2d(dtype=wp.vec4),
     b: int,
@@ -111,7 +123,15 @@ def move_one(
     speed = state.speed[b, i]
     kind = bank.kind[model]
     power = bank.power[model]
-    if controller == Controller.PLACED or controller == Controller.TRAJECTORY:
+    is_scripted = int(0)
+    is_placed = controller == Controller.PLACED or controller == Controller.TRAJECTORY
+    if controller == Controller.SCRIPT:
+        rows = bank.script[e, i]
+        if rows[3] == 1 and state.active[b, i] == Presence.AWAKE:
+            is_scripted = 1
+            target_place = script.goal[b, i]
+            is_placed = rows[2] > 0
+    if is_placed:
         if controller == Controller.PLACED:
             target_place = place[b, i]
         distance = wp.length(wp.vec2(target_place[0] - pose[0], target_place[1] - pose[1]))
@@ -123,6 +143,8 @@ def move_one(
         desired_speed = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
         new_speed = speed + wp.clamp(desired_speed - speed, -change, change)
+        if is_scripted == 1:
+            new_speed = target_place[3]
         step_length = 0.5 * (speed + new_speed) * dt
         if controller == Controller.EXTERNAL:
             turned = pose[2] + wp.clamp(control[2], -1.0, 1.0) * WALKER_TURN * dt
@@ -131,13 +153,37 @@ def move_one(
         state.travelled[b, i] = state.travelled[b, i] + wp.abs(step_length)
         speed = new_speed
     elif power[2] > 0.0:
+        surface = bank.surface[e]
+        if is_scripted == 1:
+            # the speed is the script's: the pedals give this acceleration in the limits of nobody's engine and brakes
+            acceleration = (target_place[3] - speed) / dt
+            control = wp.vec4(0.0, 1.0, control[2], 0.0)
+            if acceleration > 0.0:
+                control = wp.vec4(1.0, 0.0, control[2], 0.0)
+            power = wp.vec4(wp.abs(acceleration), wp.abs(acceleration), 1.0e3, 0.0)
+            surface = wp.vec3(wp.abs(acceleration), surface[1], surface[2])
         if speed != 0.0 or control[0] > 0.0:
-            result = bicycle(pose, speed, state.wheel[b, i], control, bank.body[model], power, dt, substeps)
+            result = bicycle(
+                pose,
+                speed,
+                state.wheel[b, i],
+                state.braking[b, i],
+                control,
+                bank.body[model],
+                power,
+                surface,
+                dt,
+                substeps,
+            )
             moved = wp.vec3(result[0], result[1], result[2])
             distance = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
             state.travelled[b, i] = state.travelled[b, i] + distance
             pose = moved
             speed = result[3]
+            if is_scripted == 1:
+                speed = target_place[3]
+            else:
+                state.braking[b, i] = result[5]
             state.wheel[b, i] = result[4]
     state.pose[b, i] = pose
     state.accel[b, i] = (speed - state.speed[b, i]) / dt
@@ -180,6 +226,7 @@ def move(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
+    script: ScriptState,
     action: wp.array2d(dtype=wp.vec4),
     place: wp.array2d(dtype=wp.vec4),
     agents: int,
@@ -194,4 +241,4 @@ def move(
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            move_one(bank, roads, state, action, place, b, i, dt, substeps)
+            move_one(bank, roads, state, script, action, place, b, i, dt, substeps)

@@ -250,10 +250,10 @@ def reset_agent(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int)
     state.speed[b, i] = start[3]
     state.accel[b, i] = 0.0
     state.wheel[b, i] = 0.0
+    state.braking[b, i] = 0.0
     state.control[b, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     state.progress[b, i] = 0
     state.phase[b, i] = 0
-    state.since[b, i] = 0
     state.travelled[b, i] = 0.0
     state.waited[b, i] = 0.0
     state.halted[b, i] = -1

@@ -30,7 +30,7 @@ def import_page_path(home: Path, town: str) -> Path:
 
 def import_page(graph: LaneGraph, report: ImportReport) -> str:
     """Return an HTML page on an imported map."""
-    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in report.lines())
+    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in report.lines(examples=None))
     key = ", ".join(
         f'<span style="background:{colour}">&emsp;</span> {kind.name.lower()}' for kind, colour in COLOURS.items()
     )

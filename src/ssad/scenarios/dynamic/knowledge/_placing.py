@@ -21,6 +21,7 @@ DEFAULT_TRIGGER = 30.0
 """Where on the route a scenario without a trigger has it, m from the start: as in SafeBench's routes."""
 _SHOULDER = 2.0  # CARLA's maps draw parking strips as shoulders wider than this
 _STRAIGHT = 0.3  # a path that strays less than this from a straight line is driven straight, as SafeBench does
+MAX_LENGTH = 1e5  # m of a path: a slip of units beyond it would fill the memory
 _PATH = 150.0  # length of the path that an actor gets on a bending road, m
 
 
@@ -144,13 +145,17 @@ def lane_path(graph: LaneGraph, place: LanePosition, distance: float) -> F64:
 
 
 def polyline_route(xy: F64, *, spacing: float = 1.0) -> Route:
-    """Return a route along points [N, 2] off the lane graph. RouteError if it is too short."""
+    """Return a route along points [N, 2] off the lane graph. RouteError if it is too short or beyond 100 km."""
     steps = np.hypot(*np.diff(xy, axis=0).T)
     distinct = np.concatenate([[True], steps > 1e-6])
     xy = xy[distinct]
     arc_length = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-6])])
     if len(xy) < 2 or arc_length[-1] < spacing:
         raise RouteError(f"a path of {arc_length[-1]:.2f} m is too short; give it at least {spacing:g} m")
+    if not arc_length[-1] <= MAX_LENGTH:
+        raise RouteError(
+            f"a path of {arc_length[-1] / 1000:.3g} km is too long; give it at most {MAX_LENGTH / 1000:g} km"
+        )
     positions = np.arange(0.0, arc_length[-1] + 1e-9, spacing)
     resampled = np.stack(
         [np.interp(positions, arc_length, xy[:, 0]), np.interp(positions, arc_length, xy[:, 1])], axis=1
@@ -308,7 +313,7 @@ def scripted_agent(
         model=body,
         controller=Controller.SCRIPT,
         pose=pose,
-        target_speed=max(phase.speed for phase in phases),
+        target_speed=max(phase.speed or 0.0 for phase in phases),
         phases=tuple(phases),
         route=route,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from ssad.core.generators import Base
 from ssad.core.types import F64
 from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, TimedPath
-from ssad.world.models import model
+from ssad.world.models import agent_model
 
 STANDING = 5.0  # m/s, nominal speed of a vehicle that stands in the base
 
@@ -25,7 +25,7 @@ class AdvSim(MotionSearch):
 
     def motion(self, base: Base, way: TimedPath, agent: int, point: F64) -> F64:
         """Follow the speeds at evenly spaced moments as closely as the body allows."""
-        body = model(base.trace.models[agent])
+        body = agent_model(base.episode.agents[agent])
         nominal_speed = float(way.speed.max())
         nominal_speed = nominal_speed if nominal_speed > 0.5 else STANDING
         moments = np.linspace(way.time[0], way.time[-1], KNOTS)

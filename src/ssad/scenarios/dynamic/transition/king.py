@@ -25,7 +25,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
 from ssad.scenarios.dynamic.transition.road import raster_of
-from ssad.world.models import model
+from ssad.world.models import agent_model, model
 from ssad.world.twin import Bodies, MotionState, advance, bodies_of, box_gap, unroll
 
 STEP: Final = 0.25  # s, as KING's
@@ -152,9 +152,7 @@ class King:
     def _recorded_controls(self) -> list[dict[int, tuple[MotionState, Tensor]]]:
         """Return start state and controls [T, 4] with which the twin repeats each candidate of each base."""
         candidates = [(base_index, agent) for base_index, agents in enumerate(self._agents) for agent in agents]
-        bodies = bodies_of(
-            [self.bases[base_index].trace.models[agent] for base_index, agent in candidates], dtype=torch.float64
-        )
+        bodies = self._bodies(candidates)
         motion = torch.from_numpy(np.stack([self._motion[base_index][agent] for base_index, agent in candidates]))
         speed = torch.tensor(
             [float(self.bases[base_index].trace.speed[0, agent]) for base_index, agent in candidates],
@@ -167,6 +165,12 @@ class King:
             recorded[base_index][agent] = MotionState(*(part[row] for part in start)), controls[:, row]
         return recorded
 
+    def _bodies(self, candidates: Sequence[tuple[int, int]]) -> Bodies:
+        """Return the bodies of agents, given by the number of their base and their own."""
+        episodes = [self.bases[base_index].episode for base_index, _ in candidates]
+        models = [agent_model(episode.agents[agent]) for episode, (_, agent) in zip(episodes, candidates, strict=True)]
+        return bodies_of(models, friction=[episode.friction for episode in episodes], dtype=torch.float64)
+
     def _optimise(self, chains: Sequence[_Chain]) -> F64:
         """Improve the controls of the chains, and return their poses [N, T + 1, 3]."""
         recorded = [self._recorded[member.base][member.agent] for member in chains]
@@ -174,9 +178,7 @@ class King:
             *(torch.stack(parts) for parts in zip(*(replayed[0] for replayed in recorded), strict=True))
         )
         recorded_controls = torch.stack([replayed[1] for replayed in recorded], 1)
-        bodies = bodies_of(
-            [self.bases[member.base].trace.models[member.agent] for member in chains], dtype=torch.float64
-        )
+        bodies = self._bodies([(member.base, member.agent) for member in chains])
         ego = torch.from_numpy(np.stack([member.ego for member in chains]))
         other_boxes = torch.from_numpy(self._recorded_boxes(chains))
         weight = torch.tensor([member.weight for member in chains], dtype=torch.float64)

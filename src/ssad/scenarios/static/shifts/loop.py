@@ -14,7 +14,7 @@ from ssad.core.types import F32, F64, I32, U8, Episode
 from ssad.rendering.onboard import AgentView, OnboardCamera
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images, sky_light
 from ssad.scenarios.static.shifts.anomaly import place_objects
-from ssad.world.models import MODELS
+from ssad.world.models import agent_size
 
 
 class ShiftedCamera:
@@ -126,12 +126,7 @@ def boxes_of(sight: AgentView, speed: F32) -> tuple[TrackedBoxes, F64]:
     velocity = speed[: len(pose), None].astype(np.float64) * heading_vectors
     rows = np.flatnonzero(sight.moment.active)
     rows = rows[rows != sight.agent]
-    sizes = np.array(
-        [
-            (model.length, model.width, model.height)
-            for model in (MODELS[sight.appearance.models[agent]] for agent in rows)
-        ]
-    )
+    sizes = np.array([agent_size(sight.appearance.models[agent], sight.appearance.sizes[agent]) for agent in rows])
     sizes = sizes.reshape(-1, 3).astype(np.float64)
     centre = np.column_stack([pose[rows, :2], 0.5 * sizes[:, 2]]).reshape(-1, 3)
     names = tuple(str(agent) for agent in rows)
