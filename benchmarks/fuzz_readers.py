@@ -40,6 +40,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ssad.core.errors import SSADError
+from ssad.core.import_report import ImportReport
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS, MEMORY_BYTES = 10.0, 2 << 30
@@ -305,6 +306,7 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     ".yaml": (change_yaml, change_yaml, change_tokens, change_bytes),
     ".xml": (change_xml, change_xml, change_tokens, change_bytes),
     ".xodr": (change_xml, change_xml, change_tokens, change_bytes),
+    ".osm": (change_xml, change_xml, change_tokens, change_bytes),
     ".xosc": (change_xml, change_xml, change_tokens, change_bytes),
     ".npz": (change_npz, change_npz, change_zip, change_bytes),
     ".safetensors": (change_safetensors, change_bytes),
@@ -371,6 +373,27 @@ def _read_map(folder: Path) -> object:
     from ssad.world.roads.bake import import_map
 
     return import_map(folder / "map.xodr", "a", folder.with_name("home"))
+
+
+def _lanelet_map(folder: Path) -> Sequence[Path]:
+    from helpers.lanelet_maps import MapWriter, crossing_map
+
+    crossing = crossing_map()
+    post = crossing.way([(0.0, 70.0), (0.0, 71.0)], type="traffic_sign", subtype="de274-60")
+    limit = crossing.rule("speed_limit", [("refers", post)])
+    crossing.lanelet([(-6.0, 10.0), (-6.0, 60.0)], [(-2.0, 10.0), (-2.0, 60.0)], limit, region="de", one_way="yes")
+    crossing.lanelet([(-9.0, 30.0), (9.0, 30.0)], [(-9.0, 27.0), (9.0, 27.0)], subtype="crosswalk")
+    degrees = MapWriter(local=False)
+    degrees.lanelet([(8.4, 49.00002), (8.401, 49.00002)], [(8.4, 49.0), (8.401, 49.0)], speed_limit="30 km/h")
+    return [crossing.write(folder / "crossing.osm"), degrees.write(folder / "degrees.osm")]
+
+
+def _read_lanelet_maps(folder: Path) -> object:
+    from ssad.world.roads import import_map
+
+    for path in folder.glob("*.osm"):
+        import_map(path, "a", folder.with_name("home"))
+    return None
 
 
 def _scenarios() -> Sequence[Any]:
@@ -462,7 +485,7 @@ def _routes(folder: Path) -> Sequence[Path]:
 def _read_routes(folder: Path) -> object:
     from ssad.scenarios.dynamic import import_routes
 
-    return import_routes(folder, omissions=[])
+    return import_routes(folder, report=ImportReport(str(folder)))
 
 
 def _suite(folder: Path) -> Sequence[Path]:
@@ -775,6 +798,7 @@ READERS: dict[str, Reader] = {
     "suite": Reader(_suite, _read_suite),
     "scenarios": Reader(_scenario_file, _read_scenario_file),
     "map": Reader(_map, _read_map),
+    "lanelet2": Reader(_lanelet_map, _read_lanelet_maps),
     "town": Reader(_graph, _read_graph),
     "openscenario": Reader(_openscenario, _read_openscenario),
     "commonroad": Reader(_commonroad, _read_commonroad),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.command import ssad
 from helpers.lanelet_maps import MapWriter, crossing_map, straight
 
 from ssad.core.errors import MapError
@@ -387,6 +388,20 @@ def test_a_town_is_stored_without_the_opendrive_file_beside_the_map(tmp_path: Pa
     assert load_town("place").lane_count == load_town(str(tmp_path / "place.osm")).lane_count == 6
     assert not (ssad_home / "towns" / "place.xodr").exists()
     assert "Lanelet2 map" in (ssad_home / "imports" / "place.html").read_text(encoding="utf-8")
+
+
+def test_the_command_reports_in_80_columns_and_strict_refuses(tmp_path: Path, ssad_home: Path) -> None:
+    two_way(one_way="no").write(tmp_path / "a.osm")
+    done = ssad("import", "map", tmp_path / "a.osm", "--strict", "--right-hand")
+    assert done.returncode == 0, done.stderr
+    assert max(map(len, done.stdout.replace(str(tmp_path), "").splitlines())) <= 80
+    two_way(one_way="maybe").write(tmp_path / "b.osm")
+    done = ssad("import", "map", tmp_path / "b.osm", "--strict")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert not (ssad_home / "towns" / "b.npz").exists()
+    for words, problem in ((("--origin", "49"), "give latitude and longitude"), (("--projection", "x"), "choose utm")):
+        done = ssad("import", "map", tmp_path / "a.osm", *words)
+        assert (done.returncode, problem in done.stderr) == (2, True)
 
 
 def test_deleted_elements_are_passed_over(tmp_path: Path) -> None:
