@@ -1,10 +1,10 @@
-"""Import of public OpenDRIVE maps, and comparison with carla.Map.
+"""Import of public OpenDRIVE and Lanelet2 maps, and comparison with carla.Map and the library Lanelet2.
 
-    python benchmarks/opendrive_maps.py docs/results/map-imports.md esmini/esmini@COMMIT=FOLDER...
+    python -m benchmarks.opendrive_maps docs/results/map-imports.md esmini/esmini@COMMIT=FOLDER...
 
-Each folder, such as a checkout of a public repository at the commit that its name states, is searched for `.xodr`
-files. Where the extra `carla` is installed, the centres of all drivable lanes are compared with those of carla.Map at
-the same s, every half metre. The files are no part of SSAD.
+Each folder, such as a checkout of a public repository at the commit that its name states, is searched for `.xodr` and
+`.osm` files (`lanelet2_maps`). Where the extra `carla` is installed, the centres of all drivable lanes are compared
+with those of carla.Map at the same s, every half metre. The files are no part of SSAD.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.lanelet2_maps import LaneletResult, check_lanelet_map, has_lanelets, lanelet_section
 from ssad.core.errors import SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.safeio import write_atomic
@@ -43,11 +44,13 @@ for road, lane, s in np.load(sys.argv[2]).tolist():
     rows.append((np.nan,) * 2 if place is None else (place.transform.location.x, -place.transform.location.y))
 np.save(sys.argv[3], np.array(rows, np.float64).reshape(-1, 2))
 """
-PAGE = """# Public OpenDRIVE maps
+PAGE = """# Public maps
 
-> **Stored result.** Weights: none. Torch: not used. Make it anew: `python benchmarks/opendrive_maps.py OUT.md \
-NAME@COMMIT=FOLDER...`, with checkouts of the repositories below.
+> **Stored result.** Weights: none. Torch: not used. Make it anew: `python -m benchmarks.opendrive_maps OUT.md \
+NAME@COMMIT=FOLDER...`, with checkouts of the repositories below, and the package lanelet2 in the Python that \
+LANELET2_PYTHON names.
 
+## OpenDRIVE maps
 *Import*: `ssad import map` makes a town of the file. *Close*: every drivable lane, sampled each half metre, lies within
 {close:g} m of where carla.Map has it. Times are CPU seconds of one core.
 
@@ -55,12 +58,12 @@ NAME@COMMIT=FOLDER...`, with checkouts of the repositories below.
 |---|---|---:|---:|---:|---:|---:|---:|
 {rows}
 
-## Files that do not import
+### OpenDRIVE files that do not import
 Each message names the fault of the file.
 
 {errors}
 
-## Maps on which the two readers differ
+### OpenDRIVE maps on which the two readers differ
 carla.Map does not read `<border>`, loses lanes on arcs of no curvature and spirals of constant curvature, has
 coordinates in single precision, and steps along polynomial curves. Where a curve is not as long as the file says, SSAD
 stretches its parameter to the stated length, so that the next piece begins where the curve ends.
@@ -220,15 +223,19 @@ def _difference(result: Result) -> str:
 def main(out: str, *folders: str) -> None:
     """Check the maps of NAME=FOLDER arguments and write the page."""
     results: dict[str, list[Result]] = {}
+    lanelet_results: dict[str, list[LaneletResult]] = {}
     for argument in folders:
         name, _, folder = argument.rpartition("=")
-        paths = [path for path in sorted(Path(folder).rglob("*.xodr")) if path.stat().st_size]
         name = name or Path(folder).name
-        results[name] = []
+        paths = [path for path in sorted(Path(folder).rglob("*.xodr")) if path.stat().st_size]
+        lanelet_paths = [path for path in sorted(Path(folder).rglob("*.osm")) if has_lanelets(path)]
         for number, path in enumerate(paths, 1):
-            results[name].append(check_map(path))
+            results.setdefault(name, []).append(check_map(path))
             print(f"{name}: {number} of {len(paths)}", file=sys.stderr)
-    write_atomic(Path(out), page(results))
+        for number, path in enumerate(lanelet_paths, 1):
+            lanelet_results.setdefault(name, []).append(check_lanelet_map(path))
+            print(f"{name}, Lanelet2: {number} of {len(lanelet_paths)}", file=sys.stderr)
+    write_atomic(Path(out), page(results) + (lanelet_section(lanelet_results) if lanelet_results else ""))
 
 
 if __name__ == "__main__":
