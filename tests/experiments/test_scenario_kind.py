@@ -13,6 +13,7 @@ from ssad.engine.kind import Plan, Resources
 from ssad.engine.run import run
 from ssad.experiments.runs import matrices, read_plan, replay, write_report
 from ssad.experiments.suites import kind_of, load_suite
+from ssad.simulators.closed_loop import build_requested_episode
 
 SCENARIO = """\
 name: my/crossing
@@ -92,6 +93,16 @@ def test_parameters_of_a_class_and_of_the_ego_are_swept_alike(tmp_path: Path) ->
     scenario = plan.cells[-1].spec["scenario"]
     assert scenario["parameters"]["walker_speed"] == 2.0
     assert (scenario["parameters"]["ego_speed"], scenario["target_speed"]) == (5.0, 9.0)
+
+
+def test_parameters_of_a_class_of_a_package_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "templates" / "ssad-plugin" / "src")
+    sweep = "sweep={speed: [1, 2], gap: {from: 4, to: 6, step: 1}}"
+    plan = plan_of(write(tmp_path), "scenarios=ssad_example.scenario:SCENARIO", sweep)
+    assert [cell.fields["sweep.gap"] for cell in plan.cells] == [4.0, 4.0, 5.0, 5.0, 6.0, 6.0]
+    walkers = build_requested_episode(plan.cells[-1]).agents[1:]
+    assert {walker.phases[0].speed for walker in walkers} == {2.0}
+    assert walkers[1].pose.x - walkers[0].pose.x == pytest.approx(6.0, abs=0.5)
 
 
 BAD = [

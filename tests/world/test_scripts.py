@@ -480,3 +480,24 @@ def test_names_that_nothing_has_are_refused() -> None:
     half_built = swerving("a", 0.0, 1.0, straight_route(Pose(50.0, 20.0), 50.0), (LateralPhase(1), 3.5))
     with pytest.raises(ConfigError, match="1 lateral phases, 0 targets"):
         World([episode(ego(), replace(half_built, lateral_targets=()))], GRAPHS)
+    with pytest.raises(ConfigError, match="lateral phases need a route"):
+        World([episode(ego(), replace(half_built, route=None))], GRAPHS)
+
+
+def test_a_script_goes_on_where_another_driver_has_left_its_agent() -> None:
+    route = straight_route(Pose(50.0, 20.0), 200.0)
+    agent = swerving("a", 20.0, 10.0, route, (LateralPhase(1, duration=2.0, when=PhaseTrigger("time", 4.0)), 3.5))
+    world = World([episode(ego(), agent, limits=ON)], GRAPHS)
+    controls = np.zeros((1, 2, 4))
+    controls[:, 1, 1] = 0.5
+    taken = np.array([[False, True]])
+    for step in range(70):
+        if step == 10:
+            world.take(taken, Controller.EXTERNAL)
+        if step == 20:
+            world.take(taken, None)
+        before = world.array("pose")[0, 1].copy()
+        world.step(controls)
+        moved = float(np.hypot(*(world.array("pose")[0, 1] - before)[:2]))
+        assert moved <= 1.01, step  # a script that went on from its own place would jump
+    assert world.array("pose")[0, 1, 1] == pytest.approx(23.5, abs=1e-3)

@@ -340,6 +340,33 @@ class LateralPhase:
 
 
 @dataclass(frozen=True)
+class Impact:
+    """Place where an actor and the front of the ego would touch if nobody acted; it determines the actor's start.
+
+    The ego drives along its route at one speed, the actor straight ahead (along the route, if that is its heading) at
+    its start speed. An actor without a speed stands where the impact is.
+
+    Attributes:
+        distance: Way of the ego from its start to the impact, m.
+        location: Centre of the actor across the front of the ego, as a share of the ego's width: 0 is the ego's left
+            edge, 0.5 its centre line, 1 its right edge.
+        overlap: Share of the ego's width that the actor covers, in place of `location`; at 1, and where the actor is
+            too narrow, the centre lines coincide.
+        side: Side of the ego's centre line on which the centre of the actor is, with `overlap`.
+        heading: Heading of the actor relative to the route, rad: 0 the same direction, pi oncoming, pi / 2 from the
+            right to the left of the ego.
+        ego_speed: Speed of the ego, m/s; None: that at its start, or its target speed if it starts from a standstill.
+    """
+
+    distance: float
+    location: float = 0.5
+    overlap: float | None = None
+    side: Literal["left", "right"] = "left"
+    heading: float = 0.0
+    ego_speed: float | None = None
+
+
+@dataclass(frozen=True)
 class Actor:
     """A scripted participant of a scenario: pose in the world frame, phases, and an optional path to follow.
 
@@ -355,6 +382,8 @@ class Actor:
     lanes; a walker's own line), at `target_speed` m/s on a free road.
 
     `body` states dimensions and limits that differ from those of the model.
+
+    With `impact`, its pose and path follow from the place where it and the ego would collide; a file states neither.
     """
 
     name: str
@@ -368,6 +397,7 @@ class Actor:
     body: Body = Body()
     speed: float = 0.0
     lateral: tuple[LateralPhase, ...] = ()
+    impact: Impact | None = None
 
 
 @dataclass(frozen=True)

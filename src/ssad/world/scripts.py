@@ -61,6 +61,8 @@ class ScriptTables:
         for index, agent in enumerate(episode.agents):
             label = f"episode {episode.key}: agent {agent.name}"
             lookup = _Lookup(label, index, agent.name, names, phase_rows)
+            if agent.lateral and (agent.route is None or len(agent.route.xy) < 2):
+                raise ConfigError(f"{label}: lateral phases need a route of at least two points")
             if len(agent.lateral_targets) != len(agent.lateral):
                 raise ConfigError(f"{label}: {len(agent.lateral)} lateral phases, {len(agent.lateral_targets)} targets")
             for number, phase in enumerate(agent.phases):

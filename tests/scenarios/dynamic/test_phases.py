@@ -137,6 +137,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (when(any=[{"kind": "time", "value": -1.0}]), "when.any[0].value: must not be negative"),
     (when(all=[{"kind": "near"}]), 'when.all[0].kind: "near" is not one of'),
     (when(any=[{"knd": "time"}]), "when.any[0].knd: unknown key; known: kind, value"),
+    (when(kind="distance", value=5.0, actor=1), "when.actor: the kind distance names agents by `agent` and `ref"),
+    (when(kind="phase_end", agent="b", phase="one", value=2.0), "when.value: the kind phase_end has none; `delay`"),
     # triggers of which it is certain that they never fire
     (when(kind="distance", value=0.0), "when.value: never fires: distance is never below 0"),
     (when(kind="always", edge="rising"), "when.edge: never fires: what always holds never changes"),

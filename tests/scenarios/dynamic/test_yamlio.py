@@ -425,7 +425,7 @@ BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (waiting(actor=0), waiting(actor=1), "phases[0].when.actor: there are actors 0 to 0"),
     (waiting(actor=0), waiting(actor=-1), "phases[0].when.actor: there are actors 0 to 0"),
     ({"type": "Custom"}, {"type": "Nothing"}, "type: "),
-    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+/"),
+    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+=/"),
     ({"parameters": {"speed": 17}}, {"parameters": {"speed": 17.01}}, "parameters.speed: 17.01 is outside 7 to 17 m/s"),
     (actor(), actor() | {"type": "RightTurn"}, "actors: only type Custom takes actors; RightTurn makes its own"),
 ]

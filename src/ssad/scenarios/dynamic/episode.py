@@ -27,6 +27,7 @@ from ssad.core.types import (
 )
 from ssad.scenarios.dynamic.catalogue import scenario_type
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
+from ssad.scenarios.dynamic.knowledge._impact import place_actors
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import move_pose
 from ssad.scenarios.dynamic.sampling import sample_parameters
@@ -93,6 +94,10 @@ def _build_one(
     scenario_kind = scenario_type(scenario.type)
     scenario = _fill_in_defaults(scenario, scenario_kind)
     values = scenario_kind.values(scenario.parameters)
+    try:
+        scenario = place_actors(scenario, route, values["ego_longitudinal"], values["ego_speed"])
+    except RouteError as error:
+        raise RouteError(f"scenario {scenario.name}: {error}") from None
     ego = EpisodeAgent(
         name="ego",
         model=scenario.ego_model,

@@ -195,6 +195,10 @@ def _trigger_problems(trigger: PhaseTrigger, place: Place, actors: Sequence[Acto
     for key, name in (("agent", trigger.agent), ("reference", trigger.reference)):
         if name and name != actor.name:
             yield from _agent_problem(name, (*place, key), actors, "")
+    if trigger.actor and kind in (*PAIRS, *PHASE_KINDS, "speed", "acceleration", "standstill", "position"):
+        yield (*place, "actor"), f"the kind {kind} names agents by `agent` and `reference`"
+    if trigger.value and kind in PHASE_KINDS:
+        yield (*place, "value"), f"the kind {kind} has none; `delay` waits after the phase"
     if kind == "position" and trigger.position is None:
         yield place, "key 'position' is missing"
     if trigger.position is not None:

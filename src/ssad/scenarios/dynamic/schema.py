@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -20,6 +21,7 @@ from ssad.core.types import (
     Body,
     DeclaredParameter,
     EpisodeLimits,
+    Impact,
     LateralPhase,
     Phase,
     PhaseTrigger,
@@ -49,6 +51,7 @@ _DATA = (
     TrafficPlan,
     EpisodeLimits,
     DeclaredParameter,
+    Impact,
 )
 _DERIVED = ("declared", "expressions")  # fields of a scenario that stand elsewhere in its file
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+=\-]*(/[A-Za-z0-9_][A-Za-z0-9_.:@+=\-]*)*$")
@@ -103,7 +106,7 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
         if key in data:
             raise source_document.error((*place, key), f"unknown key; known: {', '.join(_fields_at(()))}")
     try:
-        data = resolve_data(data, source_document, place)
+        data = _with_poses(resolve_data(data, source_document, place), source_document, place)
         # JSON mode is the strict one that still takes lists for tuples and words for literals
         text = json.dumps(data, default=str)
         scenario = _adapter().validate_json(text, strict=True)
@@ -117,6 +120,22 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
         suffix = f" (the value of '{expression}')" if expression else ""
         raise source_document.error((*place, *location), message + suffix)
     return scenario
+
+
+def _with_poses(data: dict[str, Any], document: Document, place: Location) -> dict[str, Any]:
+    """Return data in which actors with an impact have a pose, which their episode replaces."""
+    actors = data.get("actors")
+    if not isinstance(actors, list) or not any(isinstance(a, Mapping) and a.get("impact") for a in actors):
+        return data
+    placed_actors = list(actors)
+    for index, actor in enumerate(actors):
+        if isinstance(actor, Mapping) and actor.get("impact"):
+            for key in ("pose", "path"):
+                if key in actor:
+                    message = f"an actor with an impact has no {key}, which follows from it"
+                    raise document.error((*place, "actors", index, key), message)
+            placed_actors[index] = {**actor, "pose": {"x": 0.0, "y": 0.0}}
+    return {**data, "actors": placed_actors}
 
 
 def check(scenario: Scenario) -> None:
@@ -168,6 +187,7 @@ def _fields_at(location: Location) -> list[str]:
         "traffic": TrafficPlan,
         "limits": EpisodeLimits,
         "parameters": DeclaredParameter,
+        "impact": Impact,
         "body": Body,
         "ego_body": Body,
     }
@@ -293,8 +313,31 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
             yield (*location, "path"), "a path needs at least two points"
         yield from _trajectory(actor, location)
         yield from _policy(actor, location, max_speed)
+        yield from _impact(actor, location)
         max_speeds[actor_index] = max_speed
     yield from phase_problems(scenario.actors, max_speeds)
+
+
+def _impact(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    impact = actor.impact
+    if impact is None:
+        return
+    location = (*place, "impact")
+    if actor.trajectory:
+        yield location, "an actor with a trajectory has no impact"
+    if not 0.0 < impact.distance <= _MAX_COORDINATE:
+        yield (*location, "distance"), f"{impact.distance:g} is outside 0 to {_MAX_COORDINATE:g} m"
+    if not -2.0 <= impact.location <= 3.0:
+        yield (*location, "location"), f"{impact.location:g} is outside -2 to 3 widths of the ego"
+    if impact.overlap is not None:
+        if not 0.0 <= impact.overlap <= 1.0:
+            yield (*location, "overlap"), f"{impact.overlap:g} is outside 0 to 1"
+        if impact.location != Impact.location:
+            yield (*location, "location"), "give either the location or the overlap"
+    if impact.ego_speed is not None and not 0.0 < impact.ego_speed <= MAX_SPEED:
+        yield (*location, "ego_speed"), f"{impact.ego_speed:g} is outside 0 to {MAX_SPEED:g} m/s"
+    if abs(impact.heading) > 2.0 * math.pi:
+        yield (*location, "heading"), f"{impact.heading:g} is more than a full turn; angles are in radians"
 
 
 def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -348,6 +391,10 @@ def scenario_data(scenario: Scenario, *, defaults: bool = False) -> dict[str, An
         Data for YAML or JSON; `scenario_from` restores the scenario.
     """
     data: dict[str, Any] = _plain(dataclasses.replace(scenario, declared={}, expressions={}), defaults)
+    for actor, actor_data in zip(scenario.actors, data.get("actors", ()), strict=True):
+        if actor.impact is not None:
+            del actor_data["pose"]
+            actor_data.pop("path", None)
     insert_expressions(data, scenario)
     return data
 

@@ -25,6 +25,8 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.drive import steer_on_route
 from ssad.world.kernels.shared import boxes_touch, route_at, route_frame, row, wrap
 
+wp.set_module_options({"max_unroll": 0})  # see `traffic`
+
 AT_REST = wp.constant(0.05)  # m/s
 CLOSING = wp.constant(1.0e-3)  # m/s; below, nobody comes closer
 ON_TIME = wp.constant(1.0e-4)  # s by which rounding may delay a time
@@ -826,6 +828,19 @@ def advance_on_rail(
 
 
 @wp.func
+def rail_under(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int) -> wp.vec2:
+    """Return the place of an agent along its route and how far left of it that is, m."""
+    route = bank.route[state.episode[b], i]
+    point = row(roads.path, route[0] + state.progress[b, i])
+    pose = state.pose[b, i]
+    c = wp.cos(point[2])
+    s = wp.sin(point[2])
+    dx = pose[0] - point[0]
+    dy = pose[1] - point[1]
+    return wp.vec2(float(state.progress[b, i]) + c * dx + s * dy, c * dy - s * dx)
+
+
+@wp.func
 def run_one(
     bank: EpisodeArrays,
     roads: Roads,
@@ -839,6 +854,9 @@ def run_one(
     """Decide the motion of a scripted agent in this step."""
     e = state.episode[b]
     controller = state.controller[b, i]
+    if controller != Controller.SCRIPT and bank.script[e, i][2] > 0:
+        # another driver has it now; the script would go on from where that one leaves it
+        script.rail[b, i] = rail_under(bank, roads, state, b, i)
     if controller == Controller.FOLLOW:
         if script.running[b, i][0] > 0:
             state.cruise[b, i] = script.course[b, i][1]
