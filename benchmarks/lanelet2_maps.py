@@ -1,4 +1,9 @@
-"""Import of public Lanelet2 maps, and comparison with the library Lanelet2; a part of `opendrive_maps`.
+"""Import of public Lanelet2 maps, and comparison with the library Lanelet2.
+
+    LANELET2_PYTHON=... python -m benchmarks.lanelet2_maps --page OWNER/REPOSITORY@COMMIT=FOLDER...
+
+Each folder, such as a checkout of a public repository at the commit that its name states, is searched for `.osm` files
+that have a lanelet. The files are no part of SSAD. `--page` writes docs/results/map-imports.md.
 
 The library is looked for in the Python that the environment variable LANELET2_PYTHON names (`pip install lanelet2`), by
 default in this one. It reads the same file, projects it around the same place, and says bounds, centre lines and the
@@ -7,6 +12,7 @@ lanelets that a vehicle can follow.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -23,6 +29,7 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.insert import insert
 from ssad.core.errors import SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.types import LaneType
@@ -60,27 +67,10 @@ json.dump(
     open(sys.argv[4], "w"),
 )
 """
-SECTION = """
-## Lanelet2 maps
-*Import*: as above. *Compared*: the library Lanelet2 reads the file too, with latitude and longitude. *In the middle*:
-share of the points of all lanes that lie within {close:g} m of the middle of the bounds that the library has; in
-brackets that of the library's own centre lines, which have a corner at each point of a bound. *Apart*: median and
-99th percentile of the distance between both lines, m. *Links*: lanes for vehicles that follow each other here and
-there, here alone, there alone. Files without a lanelet do not count: they are OpenStreetMap's.
-
-| Maps of | commit | files | import | share | compared | in the middle | apart | links | longest import, s |
-|---|---|---:|---:|---:|---:|---:|---:|---:|---:|
-{rows}
-
-### Lanelet2 files that do not import
-{errors}
-
-### Lanelet2 maps with other links
-Here alone: lanelets that end and begin at points in one place that are not the same point. There alone: ways into a
-lanelet of two directions (`one_way=no`) against its first direction, which have no lane here.
-
-{differences}
-"""
+HEAD = (
+    "| Maps of | commit | files | import | share | compared | in the middle | apart, m | links | longest import, s |",
+    "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+)
 
 
 @dataclass
@@ -189,10 +179,10 @@ def _dense(line: Array) -> Array:
     return np.stack([np.interp(places, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def lanelet_section(folders: Mapping[str, Sequence[LaneletResult]]) -> str:
-    """Return the section on Lanelet2 maps of folders, by names such as owner/repository@commit."""
+def table(folders: Mapping[str, Sequence[LaneletResult]]) -> list[str]:
+    """Return the rows of the table on the maps of folders, by names such as owner/repository@commit."""
     everything = [result for results in folders.values() for result in results]
-    rows, errors, differences = [], [], []
+    rows = list(HEAD)
     for name, results in [*folders.items(), ("all", everything)]:
         good = [result for result in results if not result.error]
         compared = [result for result in good if result.offsets is not None]
@@ -214,18 +204,53 @@ def lanelet_section(folders: Mapping[str, Sequence[LaneletResult]]) -> str:
             f"{max((result.seconds for result in good), default=0.0):.1f}",
         )
         rows.append(f"| {' | '.join(cells)} |")
-    for name, results in folders.items():
-        repository = name.partition("@")[0]
-        errors += [f"* {repository}: {result.error}" for result in results if result.error]
-        differences += [
-            f"* {repository}, {result.path.name}: {len(result.places)} links, such as {result.places[0]}"
-            for result in results
-            if result.places
-        ]
-    return SECTION.format(
-        close=CLOSE, rows="\n".join(rows), errors="\n".join(errors), differences="\n".join(differences)
-    )
+    return rows
+
+
+def faults(folders: Mapping[str, Sequence[LaneletResult]]) -> list[str]:
+    """Return a line for each file that does not import."""
+    return [
+        f"* {name.partition('@')[0]}: {result.error}"
+        for name, results in folders.items()
+        for result in results
+        if result.error
+    ]
+
+
+def other_links(folders: Mapping[str, Sequence[LaneletResult]]) -> list[str]:
+    """Return a line for each map with links that only one of the two has."""
+    return [
+        f"* {name.partition('@')[0]}, {result.path.name}: {len(result.places)} links, such as {result.places[0]}"
+        for name, results in folders.items()
+        for result in results
+        if result.places
+    ]
 
 
 def _share(offsets: Array) -> str:
     return f"{100 * float((offsets <= CLOSE).mean()):.1f} %"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Check the maps of NAME=FOLDER arguments, and print the results or write them into the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folders", nargs="+", metavar="NAME@COMMIT=FOLDER")
+    parser.add_argument("--page", action="store_true", help="write docs/results/map-imports.md")
+    options = parser.parse_args(arguments)
+    results: dict[str, list[LaneletResult]] = {}
+    for argument in options.folders:
+        name, _, folder = argument.rpartition("=")
+        paths = [path for path in sorted(Path(folder).rglob("*.osm")) if has_lanelets(path)]
+        for number, path in enumerate(paths, 1):
+            results.setdefault(name or Path(folder).name, []).append(check_lanelet_map(path))
+            print(f"{name}: {number} of {len(paths)}", file=sys.stderr)
+    parts = {"lanelet2": table(results), "lanelet2-faults": faults(results), "lanelet2-links": other_links(results)}
+    for mark, lines in parts.items():
+        if options.page:
+            insert("results/map-imports.md", mark, ["", *lines, ""])
+        else:
+            print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

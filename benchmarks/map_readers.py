@@ -24,6 +24,7 @@ from benchmarks.insert import insert, store_commit
 from ssad import World, build_episode, load_scenarios, make_system, rollout
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.traces import motion_hash
 from ssad.core.types import EpisodeTrace, LaneType, Scenario
 from ssad.simulators.closed_loop import policies_of
 from ssad.world.roads import bake, town_xodr
@@ -104,13 +105,17 @@ def read_twice(names: Sequence[str], revision: str) -> tuple[dict[str, LaneGraph
         return earlier, {path.stem: bake(path) for path in paths}
 
 
-def drive(scenarios: Sequence[Scenario], graphs: Mapping[str, LaneGraph], system: str) -> list[Outcome]:
-    """Return the outcome of each scenario with a system."""
+def drive(scenarios: Sequence[Scenario], graphs: Mapping[str, LaneGraph], system: str) -> list[EpisodeTrace]:
+    """Return the drive of a system in each scenario."""
     episodes = [build_episode(scenario, graphs[scenario.town], seed=0) for scenario in scenarios]
     policies = {name: make_system(name) for scenario in scenarios for name in policies_of(scenario)}
     towns = {town: graphs[town] for town in {scenario.town for scenario in scenarios}}
-    traces = rollout(World(episodes, towns), make_system(system), policies=policies.__getitem__)
-    return [outcome(trace) for trace in traces]
+    return rollout(World(episodes, towns), make_system(system), policies=policies.__getitem__)
+
+
+def is_same_drive(first: EpisodeTrace, second: EpisodeTrace) -> bool:
+    """Return whether two drives are equal to the bit in the motion of all agents."""
+    return motion_hash(first) == motion_hash(second)
 
 
 def town_rows(earlier: Mapping[str, LaneGraph], current: Mapping[str, LaneGraph]) -> Iterator[str]:
@@ -132,23 +137,25 @@ def town_rows(earlier: Mapping[str, LaneGraph], current: Mapping[str, LaneGraph]
 
 def set_rows(earlier: Mapping[str, LaneGraph], current: Mapping[str, LaneGraph]) -> Iterator[str]:
     """Yield the table of sets, and the list of changed outcomes."""
-    yield "| set | drivers | drives | changed outcomes | share |"
-    yield "|---|---|---:|---:|---:|"
+    yield "| set | drivers | drives | equal to the bit | changed outcomes | share |"
+    yield "|---|---|---:|---:|---:|---:|"
     changes = []
     for reference, systems in SETS.items():
         scenarios = load_scenarios(reference)
         if not {scenario.town for scenario in scenarios} <= set(current):
             raise ConfigError(f"set '{reference}' is on towns that are not compared")
-        changed = 0
+        changed = equal = 0
         for system in systems:
             print(f"{reference}: {system}", file=sys.stderr)
             before, after = (drive(scenarios, graphs, system) for graphs in (earlier, current))
-            for scenario, first, second in zip(scenarios, before, after, strict=True):
+            for scenario, *traces in zip(scenarios, before, after, strict=True):
+                first, second = map(outcome, traces)
+                equal += is_same_drive(*traces)
                 if first != second:
                     changed += 1
                     changes.append(f"* {scenario.name}, {system}: {_difference(first, second)}")
         count = len(scenarios) * len(systems)
-        yield f"| {reference} | {', '.join(systems)} | {count} | {changed} | {100 * changed / count:.1f} % |"
+        yield f"| {reference} | {', '.join(systems)} | {count} | {equal} | {changed} | {100 * changed / count:.1f} % |"
     yield ""
     yield from changes or ["No outcome changed."]
 
@@ -173,7 +180,7 @@ def main() -> None:
     lines = [*town_rows(earlier, current), "", *set_rows(earlier, current)]
     print("\n".join(lines))
     if arguments.page:
-        insert("results/map-imports.md", "readers", lines)
+        insert("results/map-imports.md", "readers", ["", *lines, ""])
         store_commit("results/map-imports.md")
 
 

@@ -87,18 +87,40 @@ def import_openscenario(
     on: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: the file's own]")
     ] = None,
+    values: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Value of a parameter of the file.")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Scenarios to draw from a distribution.  [default: all]")
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse a file with anything that is doubtful or not carried over.")
+    ] = False,
 ) -> None:
-    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into scenarios, and say what it does not carry over.
+
+    A file of a ParameterValueDistribution becomes a set: one scenario for each set of values. The map beside the file
+    is imported with it.
+    """
     paths.check_exists(file)
-    from ssad.interchange.openscenario_reader import read_openscenario
+    from ssad.core.errors import FormatError
+    from ssad.interchange.openscenario_distributions import assigned_values
+    from ssad.interchange.openscenario_reader import read_openscenario_set
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    imported = read_openscenario(file, map_name=on)
-    save_scenarios(out, imported.scenario)
-    scenario = imported.scenario
-    print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
-    print_counted("not carried over", imported.omissions)
+    imported = read_openscenario_set(file, map_name=on, assigned=assigned_values(values or []), count=count)
+    if strict:
+        imported.report.refuse_omissions(FormatError)
+        imported.report.refuse_doubts(FormatError)
+    scenarios = imported.scenarios
+    save_scenarios(out, scenarios if len(scenarios) > 1 else scenarios[0])
+    towns = ", ".join(sorted({scenario.town for scenario in scenarios}))
+    if len(scenarios) > 1:
+        first_line = f"{len(scenarios)} scenarios in {towns}; written to {out}"
+    else:
+        first_line = f"scenario {scenarios[0].name}: {len(scenarios[0].actors)} actors in {towns}; written to {out}"
+    show_report(imported.report, first_line, out)
 
 
 def import_leaderboard(

@@ -27,7 +27,7 @@ from ssad.core.types import Episode, Pose, Scenario
 from ssad.interchange.export import ExportedFiles, episode
 from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
-from ssad.interchange.openscenario_places import AttributeReader
+from ssad.interchange.openscenario_document import AttributeReader
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE
 from ssad.scenarios.dynamic.importer import free_drive
@@ -94,7 +94,7 @@ def read_leaderboard(
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
     account = ImportReport(str(path)) if report is None else report
-    values, scenarios = AttributeReader(str(path), root), list[Scenario]()
+    values, scenarios = AttributeReader(str(path)), list[Scenario]()
     towns = town_names()
     routes = root.findall("route")
     for route_number, route in enumerate(routes):

@@ -15,7 +15,7 @@ from helpers.command import ssad
 
 from ssad.core.errors import FormatError
 from ssad.core.import_report import ImportReport
-from ssad.core.types import Pose
+from ssad.core.types import Pose, SignalPlan
 from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios, scenario_type
 from ssad.scenarios.dynamic.importer import _PARAMETERS
 from ssad.world.roads import load_graph
@@ -375,6 +375,10 @@ def test_safebench_has_32_episodes(data_dir: Path, tmp_path: Path) -> None:
     assert [len(s.placements) for s in found] == [0] * 16 + [1] * 16
     assert found[0].route == (Pose(62.5, -5.25), Pose(162.5, -5.25))
     assert found[16].placements == (Pose(-18.5, -1.75),)
+    signals = {s.type: s.signals for s in found}
+    assert signals["VehiclePassing"] == signals["StraightObstacle"] == SignalPlan("green", "red")
+    assert signals["RightTurn"] == SignalPlan("red", "green", elsewhere="green")
+    assert signals["RedlightRunning"] == SignalPlan()  # its class's own
     save_scenarios(tmp_path / "safebench.yaml", found)
     assert load_scenarios(tmp_path / "safebench.yaml") == found
 

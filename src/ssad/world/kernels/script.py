@@ -235,8 +235,9 @@ def condition_value(
             holds = not holds
     elif kind == PhaseCondition.AFTER:
         began = int(1)
-        if who[3] >= 0:
-            began = script.begun[b, who[3]]
+        before = who[3]
+        if before >= 0:
+            began = script.begun[b, before]
         if began > 0:
             holds = float(step + 1 - began) * dt >= number[0] - ON_TIME
             if form[0] == 0:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,10 +73,12 @@ def bake(
     path = Path(map_file)
     account = ImportReport(str(path)) if report is None else report
     stage = progress or (lambda text: None)
+    stage(f"reading {path.name}")
     if path.suffix == LANELET2:
         return bake_lanelet2(path, name, options=lanelet2, report=account)
     _refuse_options(path, lanelet2)
-    network = read_network(path, account)
+    with _paused_collection():
+        network = read_network(path, account)
     keys = [
         (road.id, index, lane)
         for road in network.roads.values()
@@ -96,6 +100,18 @@ def bake(
         raise MapError(f"{path}: no drivable lane in it has an area; correct the map and import it again")
     stage("linking lanes, placing signals")
     return _assemble(name or path.stem, network, shapes, sampler, account)
+
+
+@contextlib.contextmanager
+def _paused_collection() -> Iterator[None]:
+    """Pause the garbage collector, which would visit the millions of elements of a large file again and again."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def import_map(
@@ -147,13 +163,16 @@ def import_map(
         account.refuse_doubts(MapError)
     if turn_on_red is not None:
         graph = replace(graph, turn_on_red=np.array([turn_on_red]))
+    if progress:
+        progress(f"writing town {town_name}")
     source = Path(path).with_suffix(".xodr")
     # An OpenDRIVE file of the same name beside a Lanelet2 map is another map.
     has_source = source.is_file() and Path(path).suffix != LANELET2
     xodr_bytes = read_bytes(source, limit=MAX_BYTES) if has_source else None
     save_graph(graph, target)
     if xodr_bytes is not None:
-        write_atomic(target.with_suffix(".xodr"), xodr_bytes if is_baked else local_coordinates(xodr_bytes))
+        has_shift = not is_baked and graph.origin.any()
+        write_atomic(target.with_suffix(".xodr"), local_coordinates(xodr_bytes) if has_shift else xodr_bytes)
     else:
         target.with_suffix(".xodr").unlink(missing_ok=True)  # remove the source of an earlier map of this name
     write_atomic(import_page_path(home, town_name), import_page(graph, account))

@@ -51,6 +51,8 @@ SIGNS: Final = {
     ("se", "b1"): SignKind.YIELD,
     ("jp", "330-a"): SignKind.STOP,
 }
+# Usual limits outside towns, m/s, where a map states the type of a road and no limit (Germany: 130, 100 km/h).
+TYPE_SPEEDS: Final = {"motorway": 130.0 / 3.6, "rural": 100.0 / 3.6, "lowSpeed": 30.0 / 3.6}
 SPEED_SIGNS: Final = {("", "274"): 1.0 / 3.6, ("us", "r2-1"): 0.44704, ("at", "52-10a"): 1.0 / 3.6}  # default unit
 STOP_LINES: Final = {("", "294"), ("at", "haltelinie")}
 COUNTRIES: Final = {
@@ -637,7 +639,7 @@ class _Reader:
         return tuple(result)
 
     def speed_limits(self, road: Element, location: str) -> list[tuple[float, float | None]]:
-        """Return positions and limits of a road, m/s: of its types, or of its signs if no type has one."""
+        """Return positions and limits of a road, m/s: of its types, of its signs if no type has one, or as usual."""
         limits = []
         for road_type in road.findall("type"):
             speed = road_type.find("speed")
@@ -656,7 +658,14 @@ class _Reader:
                 limits.append(
                     (0.0 if signal.get("orientation") == "-" else self.number(signal, "s", location), value * unit)
                 )
-        return sorted(limits, key=lambda limit: limit[0])
+        if limits:
+            return sorted(limits, key=lambda limit: limit[0])
+        types = [
+            (self.number(road_type, "s", location), road_type.get("type", "")) for road_type in road.findall("type")
+        ]
+        return (
+            [(s, TYPE_SPEEDS.get(kind)) for s, kind in types] if any(kind in TYPE_SPEEDS for _, kind in types) else []
+        )
 
     def lane(self, element: Element, number: int, mark: Marking, location: str, *, left_hand: bool) -> Lane:
         place = f"{location}, lane {number}"
