@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.import_report import ImportReport
 from ssad.datasets.coco import coco_data, read_coco
 
 CLASSES = ("car", "bus")
@@ -180,6 +181,23 @@ def test_a_broken_page_is_refused_in_one_line(
         read_coco(page)
     assert "\n" not in str(error.value)
     assert str(error.value).startswith(str(page))
+
+
+def test_a_report_names_what_is_left_out_of_annotations(tmp_path: Path) -> None:
+    """Boxes without height, as in COCO's own files, and annotations of no image are left out of the others."""
+    data = copy.deepcopy(coco_data(CLASSES, ROWS, {}))
+    count = len(data["annotations"])
+    data["annotations"][0] |= {"bbox": [1, 2, 3, 0], "segmentation": [[1, 2, 3, 4, 5, 6]]}
+    data["annotations"][1] |= {"image_id": 99}
+    report = ImportReport("page")
+    found = read_coco(write(tmp_path, data), report=report)
+    assert sum(len(image.box) for image in found.images) == count - 2
+    assert report.doubts == {
+        "boxes without width or height are left out": ["annotation 0"],
+        "annotations of no image or category are left out": ["annotation 1"],
+    }
+    assert report.omissions == {"segmentation of annotations": [""]}
+    assert report.contents == [f"{len(ROWS)} pictures with {count - 2} boxes of {len(CLASSES)} classes"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"images": 1}', "\x00", '{"images": [NaN'])

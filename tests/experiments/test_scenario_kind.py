@@ -63,7 +63,9 @@ def test_each_grid_point_is_a_cell(tmp_path: Path) -> None:
     assert len(plan.cells) == len(points) * 2 * 2
     assert plan.cells[0].name == "blind/my/crossing/distance=10/walk=1"
     assert plan.cells[0].spec["scenario"]["actors"][0]["phases"][0]["speed"] == "walk"
-    assert plan.kind.plan_lines(plan) == ["sweep: 6 grid points (walk 3 x distance 3 values) that meet the constraints"]
+    assert plan.kind.plan_lines(plan) == [
+        "sweep: 6 grid points (walk 3 x distance 3 values); 3 more violate a constraint or are not selected"
+    ]
 
 
 def test_points_share_seed_and_cluster(tmp_path: Path) -> None:

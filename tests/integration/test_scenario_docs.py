@@ -14,12 +14,15 @@ from ssad.core.types import (
     Actor,
     Arrival,
     Controller,
+    DeclaredParameter,
     Episode,
+    Impact,
     LateralPhase,
     Phase,
     PhaseTrigger,
     TriggerKind,
 )
+from ssad.experiments.suites import kind_of, load_suite
 from ssad.scenarios.dynamic import SCENARIOS, build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.knowledge._kind import EGO_START, TARGET_SPEED_SPREAD
 from ssad.world.models import MODELS
@@ -62,7 +65,7 @@ def test_everything_in_the_examples_of_actors_happens(tmp_path: Path) -> None:
         assert begun[scene, :count].all(), ACTOR_EXAMPLES[scene]
 
 
-@pytest.mark.parametrize("table", [Actor, Phase, LateralPhase, PhaseTrigger, Arrival])
+@pytest.mark.parametrize("table", [Actor, Phase, LateralPhase, PhaseTrigger, Arrival, Impact, DeclaredParameter])
 def test_the_reference_has_every_key(table: type) -> None:
     for field in dataclasses.fields(table):
         assert f"`{field.name}`" in PAGE, field.name
@@ -91,3 +94,24 @@ def test_the_table_has_the_egos_start() -> None:
 
 def test_the_models_are_listed() -> None:
     assert f"Models: {', '.join(MODELS)}." in GUIDE
+
+
+SWEEP_GUIDE = (DOCS / "how-to" / "sweep-parameters.md").read_text()
+
+
+def test_the_examples_of_sweeps_run(tmp_path: Path) -> None:
+    examples = re.findall(r"```yaml\n# (\S+)\n(.*?)```", SWEEP_GUIDE, re.S)
+    assert [name for name, _ in examples] == ["crossing.yaml", "grid.yaml", "overlap.yaml"]
+    for name, text in examples:
+        (tmp_path / name).write_text(text)
+    suite = load_suite(str(tmp_path / "grid.yaml"))
+    kind = kind_of("driving")
+    plan = kind.plan(suite)
+    (line,) = kind.plan_lines(plan)
+    assert f"\n{line}\n" in SWEEP_GUIDE
+    cells = {cell.name for cell in plan.cells}
+    assert set(re.findall(r"`(blind/my/\S+)`", SWEEP_GUIDE)) <= cells
+    (scenario,) = load_scenarios(tmp_path / "overlap.yaml")
+    car, walker = build_episode(scenario, load_town(scenario.town), seed=0).agents[1:]
+    assert car.pose.y + 5.25 == pytest.approx(1.03)
+    assert (walker.speed, walker.pose.y) == (1.4, pytest.approx(-5.25 - 0.25 * 2.06 - 1.4 * 6.0))

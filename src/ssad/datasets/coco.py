@@ -12,6 +12,7 @@ import numpy as np
 from ssad.core import safeio
 from ssad.core.errors import FormatError
 from ssad.core.folders import data_path
+from ssad.core.import_report import ImportReport
 from ssad.core.types import F64, I32, Bool
 
 MAX_FILE_BYTES: Final = 1 << 30  # size limit of an annotation file
@@ -88,13 +89,15 @@ def coco_data(
     return {"info": dict(metadata), "images": image_rows, "annotations": annotation_rows, "categories": categories}
 
 
-def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
+def read_coco(path: Path, *, images: Path | None = None, report: ImportReport | None = None) -> CocoSet:
     """Read an annotation file.
 
     Args:
         path: The file.
         images: Folder of the pictures; by default `images` beside the file's folder if it exists, else the
             file's own folder.
+        report: Filled with what came in, what is not read, and what is doubtful: annotations of no image or category,
+            and boxes without width or height, as COCO's own files have them, which are left out; None: they raise.
 
     Returns:
         The pictures with their boxes.
@@ -121,8 +124,13 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
             raise FormatError(f"{path}: two images or two categories of one id")
         for index, record in enumerate(content["annotations"]):
             if record["image_id"] not in annotations_by_image or record["category_id"] not in class_names:
-                raise FormatError(f"{path}: annotation {index} belongs to no image or category of the file")
-            annotations_by_image[record["image_id"]].append(record)
+                if report is None:
+                    raise FormatError(f"{path}: annotation {index} belongs to no image or category of the file")
+                report.doubt("annotations of no image or category are left out", f"annotation {index}")
+            elif report is not None and _is_empty(record):
+                report.doubt("boxes without width or height are left out", f"annotation {index}")
+            else:
+                annotations_by_image[record["image_id"]].append(record)
         # COCO ids may have gaps; labels count from 0 in the order of the ids.
         label_by_category = {category_id: key for key, category_id in enumerate(sorted(class_names))}
         pictures = tuple(
@@ -132,7 +140,19 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
         _check_links(folder, pictures)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
+    if report is not None:
+        box_count = sum(len(picture.box) for picture in pictures)
+        report.contents.append(f"{len(pictures)} pictures with {box_count} boxes of {len(class_names)} classes")
+        for key in ("segmentation", "keypoints", "caption"):
+            if count := sum(bool(record.get(key)) for record in content["annotations"]):
+                report.omit(f"{key} of annotations", count=count)
     return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
+
+
+def _is_empty(annotation: Mapping[str, Any]) -> bool:
+    """Return whether the box of an annotation, as far as it is one, has no width or no height."""
+    box = annotation["bbox"]
+    return isinstance(box, list) and len(box) == 4 and min(float(box[2]), float(box[3])) <= 0.0
 
 
 def _check_links(folder: Path, pictures: Sequence[CocoImage]) -> None:

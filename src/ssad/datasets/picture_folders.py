@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -11,6 +12,7 @@ from typing import Final, Literal
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.folders import is_linkable, link_remedy
 from ssad.core.image_files import is_image
+from ssad.core.import_report import ImportReport
 from ssad.datasets.point_files import KITTI_COLUMNS, NUSCENES_COLUMNS
 
 Kind = Literal["image", "points", "label", "other", "link", "refused"]
@@ -91,6 +93,32 @@ def list_folder(root: Path) -> list[FolderFile]:
                 file = replace(file, kind="refused", target="a symbolic link to a folder that is listed already")
             files.append(file)
     return sorted(files, key=lambda file: file.key)
+
+
+def folder_report(root: Path) -> ImportReport:
+    """Return a report on a folder of pictures: what is read, and files that are not.
+
+    Raises:
+        StoreError: A folder cannot be read.
+    """
+    report = ImportReport(str(root))
+    files = list_folder(root)
+    counts = Counter(file.kind for file in files)
+    report.contents.append(f"{counts['image']} pictures, {counts['points']} point clouds")
+    for file in files:
+        if file.kind == "label":
+            report.omit("pictures in folders of labels", file.key)
+        elif file.kind == "other":
+            report.omit(f"files that are neither pictures nor point clouds: {_suffix(file)}", file.key)
+        elif file.kind == "link":
+            report.note("links to files of the folder stand for these", file.key)
+        elif file.kind == "refused":
+            report.doubt(f"not read: {file.target}", file.key)
+    return report
+
+
+def _suffix(file: FolderFile) -> str:
+    return file.path.suffix.lower()[:20] or "without a suffix"
 
 
 def _describe(path: Path, entry: os.DirEntry[str], root: Path) -> FolderFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,12 +177,24 @@ class ScenarioKind(Kind):
         suite = plan.suite
         if not suite.sweep:
             return []
+        from ssad.scenarios.dynamic.parameters import grid_values
+
         points = {cell.spec["scenario"]["name"]: cell.fields for cell in plan.cells}
-        axes = {name: {fields[f"{SWEEP}{name}"] for fields in points.values()} for name in suite.sweep}
-        sizes = (" with " if suite.sweep_mode == "zip" else " x ").join(f"{name} {len(axes[name])}" for name in axes)
         scenario_count = len({fields["swept"] for fields in points.values()})
+        sizes = {
+            name: len({fields[f"{SWEEP}{name}"] for fields in points.values()})
+            if entry == DECLARED_GRID
+            else len(grid_values(entry))
+            for name, entry in suite.sweep.items()
+        }
+        is_zip = suite.sweep_mode == "zip"
+        total = scenario_count * (min(sizes.values()) if is_zip else math.prod(sizes.values()))
+        size_text = (" with " if is_zip else " x ").join(f"{name} {size}" for name, size in sizes.items())
         scenario_text = "" if scenario_count == 1 else f" of {scenario_count} scenarios"
-        return [f"sweep: {len(points)} grid points{scenario_text} ({sizes} values) that meet the constraints"]
+        # Grids that several scenarios declare may have different sizes.
+        is_complete = DECLARED_GRID not in suite.sweep.values() and total > len(points)
+        left_out = f"; {total - len(points)} more violate a constraint or are not selected" if is_complete else ""
+        return [f"sweep: {len(points)} grid points{scenario_text} ({size_text} values){left_out}"]
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Store copies of the towns beside the results, so that a report can be made where they are not imported."""

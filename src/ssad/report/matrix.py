@@ -17,6 +17,7 @@ SWEEP: Final = "sweep."
 """Start of the names of the fields that have the values of swept parameters."""
 MAX_SLICES: Final = 6
 """Most values of further parameters that have matrices of their own; over more of them the matrix is a mean."""
+BETWEEN: Final = " \\ "  # between the parameters in the rows and in the columns
 EMPTY: Final = TableCell.value(None)
 NOTE: Final = (
     "Points of a grid share their route and their random draws: they are one cluster, and no interval is taken over "
@@ -96,7 +97,7 @@ def matrix_tables(run: Run, metric: str, title: str, *, kind: Kind = "share", ax
                     Table(
                         f"matrix-{len(tables) + 1}" if tables else "matrix",
                         f"{title}: {subject}" if subject else title,
-                        (" \\ ".join(_with_unit(lines, name) for name in (row_name, column_name) if name),),
+                        (BETWEEN.join(_with_unit(lines, name) for name in (row_name, column_name) if name),),
                         tuple(_text(value) for value in _column_values(slice_lines, column_name)),
                         rows,
                         note=f"{_count_note(rows, _mean_note(lines, others) if is_mean else '')} {NOTE}",
@@ -217,16 +218,20 @@ def terminal_matrices(run: Run) -> list[TerminalTable]:
     """Return the matrices of a run for the terminal, the last one with their notes; empty: it has no sweep."""
     tables = run_matrices(run)
     notes = dict.fromkeys(table.note for table in tables)
-    return [
-        TerminalTable(
-            table.title,
-            (*table.heads, *table.columns),
-            tuple(TerminalRow((*row.head, *(matrix_text(cell, table) for cell in row.cells))) for row in table.rows),
-            head_count=1,
-            note="\n".join(notes) if table is tables[-1] else "",
+    matrices = []
+    for table in tables:
+        row_head, _, column_head = table.heads[0].partition(BETWEEN)
+        rows = (TerminalRow((*row.head, *(matrix_text(cell, table) for cell in row.cells))) for row in table.rows)
+        matrices.append(
+            TerminalTable(
+                f"{table.title} (columns: {column_head})" if column_head else table.title,
+                (row_head, *table.columns),
+                tuple(rows),
+                head_count=1,
+                note="\n".join(notes) if table is tables[-1] else "",
+            )
         )
-        for table in tables
-    ]
+    return matrices
 
 
 def matrix_text(cell: TableCell, table: Table) -> str:

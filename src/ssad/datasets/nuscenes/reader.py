@@ -18,6 +18,7 @@ import numpy as np
 from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.folders import is_file_name
+from ssad.core.import_report import ImportReport
 from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.index import Index, open_index
@@ -46,6 +47,9 @@ from ssad.datasets.nuscenes.schema import (
 from ssad.datasets.nuscenes.tables import nuscenes_path, table_path
 
 R = TypeVar("R", bound=TableRecord)
+
+
+UNREAD_FOLDERS = ("can_bus", "lidarseg", "maps", "panoptic")
 
 
 class NuScenes:
@@ -80,6 +84,18 @@ class NuScenes:
     def close(self) -> None:
         """Close the index file; a later call opens it again."""
         self._index.close()
+
+    def report(self) -> ImportReport:
+        """Return a report on the folder: its scenes, and tables and folders that are not read."""
+        report = ImportReport(str(self.root))
+        report.contents.append(f"nuScenes schema {self.version}: {len(self.scenes())} scenes")
+        for path in sorted((self.root / self.version).glob("*.json")):
+            if path.stem not in TABLES:
+                report.omit("tables that are not read", f"{self.version}/{path.name}")
+        for path in sorted(self.root.iterdir()):
+            if path.name in UNREAD_FOLDERS:
+                report.omit("folders that are not read", path.name)
+        return report
 
     def scenes(self) -> list[Scene]:
         """Return all scenes, in table order."""

@@ -43,11 +43,22 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+FAST = wp.constant(27.0)  # m/s: who aims for more than any town's limit looks as far as it needs to stop gently
+SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per squared speed
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
+
+
+@wp.func
+def sight_range(cruise: float) -> float:
+    """Return how far an Autopilot looks along its route, m; cruise: the speed that it aims for, m/s."""
+    reach = SIGHT
+    if cruise > FAST:
+        reach = SIGHT_SHARE * cruise * cruise
+    return reach
 
 
 @wp.func
@@ -74,6 +85,7 @@ def lead_gap(
     heading: wp.vec2,
     margin: float,
     bend: float,
+    sight: float,
 ) -> wp.vec2:
     """Locate the agent of row j on a route that begins `u0` metres along: (gap of bumpers or FAR, its speed).
 
@@ -81,7 +93,7 @@ def lead_gap(
     metres that the route ahead leaves its straight line.
     """
     other_pose = perceived.pose[b, j]
-    along = wp.clamp(lon, 0.0, SIGHT)
+    along = wp.clamp(lon, 0.0, sight)
     lateral = float(0.0)
     residual = float(0.0)
     frame = wp.vec4(0.0, 0.0, 1.0, 0.0)
@@ -93,7 +105,7 @@ def lead_gap(
         lateral = rel_y * frame[2] - rel_x * frame[3]
         if wp.abs(residual) < 0.05:
             break
-        along = wp.clamp(along + residual, 0.0, SIGHT)
+        along = wp.clamp(along + residual, 0.0, sight)
     cosine = heading[0] * frame[2] + heading[1] * frame[3]
     sine = wp.abs(heading[0] * frame[3] - heading[1] * frame[2])
     half_along = other_body[0] * wp.abs(cosine) + other_body[1] * sine
@@ -105,7 +117,7 @@ def lead_gap(
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
     if (
         along > 0.0
-        and along < SIGHT
+        and along < sight
         and wp.abs(residual) < 1.0
         and wp.abs(lateral) < own_body[1] + half_across + margin + sweep
     ):
@@ -402,18 +414,19 @@ def scan_agents(
     state.aim[b, i] = wp.vec2(float(at) + offset, target)
     react = float(0.0)
 
+    sight = sight_range(state.cruise[b, i])
     signal_index = roads.path_signal[first]
     signal_now = int(SignalState.OFF)
-    if signal_index >= 0 and road_rule[1] - offset < SIGHT + 40.0:
+    if signal_index >= 0 and road_rule[1] - offset < sight + 40.0:
         signal_now = light(bank, roads, state, perceived, b, i, e, signal_index, dt)
     obeys = i > 0 or perceived.believes[b] == 0 or perceived.sign[b] == 1  # who does not know of a sign does not stop
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+        if line_gap > -0.5 and line_gap < sight + 20.0:
             react = idm_gap(speed, 0.0, line_gap + 1.0)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+        if line_gap > -0.5 and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
@@ -434,11 +447,13 @@ def scan_agents(
     s = wp.sin(pose[2])
     # Range within which agents matter: 4 s of driving, and the distance of comfortable braking.
     travel = wp.max(target, speed) * STRIDE * float(HORIZON)
-    view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), SIGHT)
+    view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), sight)
+    if sight > SIGHT:
+        view_range = wp.min(wp.max(view_range, SIGHT_SHARE * speed * speed), sight)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
     if is_changing_lane(shift):
-        bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - point[2]))
+        bend = bend + ASIDE + sight * wp.abs(wp.sin(pose[2] - point[2]))
     box_low = wp.vec2(pose[0], pose[1])
     box_high = box_low
     for corner in range(5):
@@ -576,12 +591,26 @@ def react_to_agents(
             bend = roads.bend[route[0] + state.progress[b, i]]
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
+            sight = sight_range(state.cruise[b, i])
             leader = lead_gap(
-                roads, perceived, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
+                roads,
+                perceived,
+                b,
+                j,
+                route,
+                shift,
+                aim[0],
+                longitudinal,
+                own_body,
+                other_half,
+                heading,
+                margin,
+                bend,
+                sight,
             )
             if leader[0] < FAR:
                 react = idm_gap(speed, wp.max(leader[1], 0.0), leader[0])
-                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, SIGHT)) * LEADERS + j)
+                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, sight)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
                 contact_range = NOSE_TO_NOSE

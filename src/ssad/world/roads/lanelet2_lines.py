@@ -37,12 +37,12 @@ def centre_line(left: F64, right: F64, centre: F64 | None = None) -> F64:
         middle = 0.5 * (_sample(left, count) + _sample(right, count))
         moved = middle[:, :2].copy()
         for _ in range(ROUNDS):
-            moved[1:-1] = 0.5 * (_nearest(moved[1:-1], left) + _nearest(moved[1:-1], right))
+            moved[1:-1] = 0.5 * (nearest_points(moved[1:-1], left) + nearest_points(moved[1:-1], right))
         steps, moved_steps = np.diff(middle[:, :2], axis=0), np.diff(moved, axis=0)
         # Where a bound doubles back, the nearest point can jump; the simple middle is then kept.
         if ((steps * moved_steps).sum(1) > 0.0).all():
             middle[:, :2] = moved
-    width = sum(np.hypot(*(middle[:, :2] - _nearest(middle[:, :2], side)).T) for side in (left, right))
+    width = sum(np.hypot(*(middle[:, :2] - nearest_points(middle[:, :2], side)).T) for side in (left, right))
     return np.column_stack([middle, width])
 
 
@@ -87,8 +87,8 @@ def _sample(line: F64, count: int) -> F64:
     return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
 
 
-def _nearest(points: F64, line: F64) -> F64:
-    """Return the nearest points [N, 2] on a line."""
+def nearest_points(points: F64, line: F64) -> F64:
+    """Return the points [N, 2] of a line [., 2] or [., 3] that are nearest to points [N, 2]."""
     rows, fractions = _projection(line[:, :2], points)
     return line[rows, :2] + fractions[:, None] * (line[rows + 1, :2] - line[rows, :2])
 

@@ -15,7 +15,10 @@ from ssad.world.roads.random_towns import RANDOM, write_random_town
 from ssad.world.roads.signals import signal_names
 from ssad.world.roads.xodr import MAX_BYTES, Network, read_network
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
+BUILT_IN = (
+    *("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach"),
+    "HighSpeedTrack",
+)
 
 
 def town_names() -> dict[str, str]:
