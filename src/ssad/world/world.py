@@ -134,6 +134,7 @@ class World:
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
+        self.work.judgement = wp.zeros((self.batch, self.agents), dtype=wp.vec2, device=device)
         if self.chance is not None:
             self.noise = noise_state(self.chance, self.episodes, assignment, self.agents, device)
         self._assign(assignment)
@@ -687,8 +688,9 @@ class World:
             hasher = hashlib.sha256()
             for name, values in arrays.items():
                 scene_values = values[scene]
-                if name == "since" and not scene_values.any():
-                    continue  # no phase waits for another: hashes are those of before some could
+                if name in {"since", "pending"} and not scene_values.any():
+                    # no phase waits for another, no driver has a reaction time: hashes are those of before some could
+                    continue
                 # empty slots that only the batch's widest scene needs do not count
                 hasher.update(
                     np.ascontiguousarray(

@@ -17,8 +17,14 @@ from ssad.world.kernels.data import (
     Roads,
     State,
 )
+from ssad.world.kernels.drivers import FIRM, delay, driver_accelerates, is_lapsed, lane_place, pedal_change
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
+
+
+HALTED = wp.constant(0.1)  # m/s
+NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
+EASES = wp.constant(0.4)  # m/s^2 of braking at the very end of a stop
 
 
 @wp.func
@@ -51,8 +57,13 @@ def condition_holds(state: State, b: int, i: int, condition: wp.vec3, dt: float)
 
 
 @wp.func
-def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, v: float) -> float:
-    """Return steering in [-1, 1]: the route's curvature slightly ahead, corrected critically damped in distance."""
+def steer_on_route(
+    bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, v: float, aside: float
+) -> float:
+    """Return steering in [-1, 1]: the route's curvature slightly ahead, corrected critically damped in distance.
+
+    aside: m left of the route on which to drive.
+    """
     route = bank.route[e, i]
     at = state.progress[b, i]
     point = row(roads.path, route[0] + at)
@@ -62,7 +73,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     dx = pose[0] - point[0]
     dy = pose[1] - point[1]
     offset = c * dx + s * dy
-    lateral = c * dy - s * dx - 0.5 * point[3] * offset * offset
+    lateral = c * dy - s * dx - 0.5 * point[3] * offset * offset - aside
     # In reverse nothing is previewed.
     forward_speed = wp.max(v, 0.0)
     reference = wp.clamp(at + int(wp.floor(offset + 0.15 * forward_speed + 0.5)), 0, route[1] - 1)
@@ -89,6 +100,38 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     slip_sine = wp.clamp(0.5 * curvature * body[2], -0.95, 0.95)
     wheel = wp.atan(2.0 * slip_sine / wp.sqrt(1.0 - slip_sine * slip_sine))
     return wp.clamp(wheel / wp.max(body[3], 1.0e-3), -1.0, 1.0)
+
+
+@wp.func
+def driven_acceleration(bank: EpisodeArrays, state: State, b: int, i: int, e: int, style: wp.vec4, dt: float) -> float:
+    """Return the acceleration to which a driver of the population comes in this step, m/s^2."""
+    speed = state.speed[b, i]
+    manner = bank.manner[e, i]
+    last = state.accel[b, i]
+    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + state.react[b, i])
+    pending = state.pending[b, i]
+    if speed < HALTED:
+        if demand <= 0.0:
+            pending = 0.0
+        elif pending < manner[2]:
+            pending = pending + dt
+            demand = -style[3]
+    elif demand < last - NOTICED and last > -NOTICED:
+        # the foot leaves the throttle at once, and then reaches the brake
+        if pending < delay(manner[2], speed):
+            pending = pending + dt
+            demand = wp.min(last, 0.0)
+    else:
+        pending = 0.0
+    if speed > HALTED and is_lapsed(bank.habit[e, i], float(state.step[b]) * dt):
+        demand = wp.max(demand, last)
+    state.pending[b, i] = pending
+    if speed < 1.5 and demand > -FIRM:
+        demand = wp.max(demand, -EASES - speed)  # comes to rest without a jolt
+    accel = pedal_change(demand, last, manner[1], dt)
+    if speed < HALTED and demand <= 0.0:
+        accel = demand
+    return accel
 
 
 @wp.func
@@ -166,7 +209,7 @@ def drive_one(
             target = 0.0
         steer = float(0.0)
         if bank.route[e, i][1] > 1:
-            steer = steer_on_route(bank, roads, state, b, i, e, speed)
+            steer = steer_on_route(bank, roads, state, b, i, e, speed, 0.0)
         throttle = float(0.0)
         brake = float(1.0)
         if bank.kind[model] == AgentKind.WALKER:
@@ -179,9 +222,16 @@ def drive_one(
     elif controller == Controller.AUTOPILOT or controller == Controller.FOLLOW:
         steer = float(0.0)
         accel = float(0.0)
+        style = bank.style[e, i]
+        has_driver = controller == Controller.AUTOPILOT and style[0] > 0.0
         if bank.route[e, i][1] > 1:
-            steer = steer_on_route(bank, roads, state, b, i, e, speed)
-        if controller == Controller.AUTOPILOT:
+            aside = float(0.0)
+            if has_driver:
+                aside = lane_place(bank.habit[e, i], float(state.step[b]) * dt)
+            steer = steer_on_route(bank, roads, state, b, i, e, speed, aside)
+        if has_driver:
+            accel = driven_acceleration(bank, state, b, i, e, style, dt)
+        elif controller == Controller.AUTOPILOT:
             free = idm_free(speed, state.aim[b, i][1])
             accel = wp.min(free, state.react[b, i])
             if free > 0.0:

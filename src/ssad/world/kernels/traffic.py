@@ -26,6 +26,16 @@ from ssad.world.kernels.data import (
     Work,
 )
 from ssad.world.kernels.drive import room_behind
+from ssad.world.kernels.drivers import (
+    RUNS_RED,
+    STOPS_AT_YELLOW,
+    driver_follows,
+    driver_speed,
+    driver_stops,
+    driver_yields,
+    is_lapsed,
+    judged_share,
+)
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
 from ssad.world.kernels.shared import (
     BRIDGE,
@@ -48,6 +58,7 @@ NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
+PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
 
 @wp.func
@@ -57,6 +68,22 @@ def idm_gap(v: float, lead: float, gap: float) -> float:
     desired_gap = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + closing_term)
     ratio = desired_gap / wp.max(gap, 0.1)
     return -IDM_ACCEL * ratio * ratio
+
+
+@wp.func
+def follow(v: float, lead: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a leader; style: see `EpisodeArrays`."""
+    if style[0] > 0.0:
+        return driver_follows(v, lead, gap, style)
+    return idm_gap(v, lead, gap)
+
+
+@wp.func
+def stop_before(v: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a place `gap` metres ahead before which one stops."""
+    if style[0] > 0.0:
+        return driver_stops(v, gap, style)
+    return idm_gap(v, 0.0, gap)
 
 
 @wp.func
@@ -283,6 +310,8 @@ def conflict_gap(
     own_body: wp.vec4,
     other_body: wp.vec2,
     lat_margin: float,
+    pace: float,
+    pick_up: float,
 ) -> float:
     """Return the distance from i's front bumper to its predicted conflict with j within 4 s, or FAR.
 
@@ -303,8 +332,8 @@ def conflict_gap(
         # it slows down for bends as the route's speed profile says
         route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
         next_speed = wp.min(
-            speed + 2.0 * STRIDE,
-            wp.min(wp.max(target, speed), wp.max(roads.rule[route_point][0], speed - 4.0 * STRIDE)),
+            speed + pick_up * STRIDE,
+            wp.min(wp.max(target, speed), wp.max(pace * roads.rule[route_point][0], speed - 4.0 * STRIDE)),
         )
         along = along + 0.5 * (speed + next_speed) * STRIDE
         speed = next_speed
@@ -396,7 +425,17 @@ def scan_agents(
     own_body = bank.body[bank.model[e, i]]
     point = row(roads.path, first)
     offset = (pose[0] - point[0]) * wp.cos(point[2]) + (pose[1] - point[1]) * wp.sin(point[2])
+    style = bank.style[e, i]
     speed_cap = wp.min(road_rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
+    if style[0] > 0.0:
+        time = float(state.step[b]) * dt
+        manner = bank.manner[e, i]
+        habit = bank.habit[e, i]
+        speed_cap = driver_speed(roads, route, at, speed, manner[0], style[3])
+        blind = float(0.0)
+        if is_lapsed(habit, time):
+            blind = 1.0
+        work.judgement[b, i] = wp.vec2(judged_share(manner, habit, time), blind)
     shift = state.shift[b, i]
     target = wp.min(wp.min(state.cruise[b, i], speed_cap), change_speed(shift, float(at) + offset))
     state.aim[b, i] = wp.vec2(float(at) + offset, target)
@@ -410,13 +449,17 @@ def scan_agents(
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < SIGHT + 20.0:
-            react = idm_gap(speed, 0.0, line_gap + 1.0)
+            react = stop_before(speed, line_gap + 1.0, style)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < SIGHT + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
+                if style[0] > 0.0:
+                    stop = speed * speed < 2.0 * STOPS_AT_YELLOW * wp.max(line_gap, 0.5)
+            elif style[0] > 0.0 and speed > 4.0 and speed * speed > 2.0 * RUNS_RED * wp.max(line_gap, 0.5):
+                stop = False  # the decision to go was made at yellow
             if (
                 signal_now == SignalState.RED
                 and int(road_rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
@@ -425,7 +468,7 @@ def scan_agents(
             ):
                 stop = False  # turn to the near side on red, after a stop, where allowed; it yields below
             if stop:
-                react = wp.min(react, idm_gap(speed, 0.0, line_gap + 1.0))
+                react = wp.min(react, stop_before(speed, line_gap + 1.0, style))
     state.react[b, i] = react
     state.stalled[b, i] = 0
     work.leader[b, i] = NO_LEADER
@@ -557,6 +600,10 @@ def react_to_agents(
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
+        style = bank.style[e, i]
+        judgement = wp.vec2(1.0, 0.0)
+        if style[0] > 0.0:
+            judgement = work.judgement[b, i]
         first = route[0] + state.progress[b, i]
         offset = aim[0] - float(state.progress[b, i])
         line = line_ahead(roads, first, offset, own_body[0])
@@ -580,7 +627,7 @@ def react_to_agents(
                 roads, perceived, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
             )
             if leader[0] < FAR:
-                react = idm_gap(speed, wp.max(leader[1], 0.0), leader[0])
+                react = follow(speed, wp.max(leader[1], 0.0), judgement[0] * leader[0], style)
                 wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, SIGHT)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
@@ -605,17 +652,39 @@ def react_to_agents(
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
                 if line > -1.0 and leader[0] > line + 3.0 and leader[0] < required_room and leader[1] < 1.5:
-                    react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
+                    react = wp.min(react, stop_before(speed, wp.max(line, 0.0) + 1.0, style))
         if flags >= 2 and leads == 0:
             margin = 0.4
             if walks:
                 margin = 1.0
+            pick_up = float(PICKS_UP)
+            if style[0] > 0.0:
+                pick_up = 0.8 * style[2]
             gap = conflict_gap(
-                roads, perceived, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin
+                roads,
+                perceived,
+                b,
+                j,
+                route,
+                shift,
+                aim[0],
+                speed,
+                aim[1],
+                own_body,
+                other_half,
+                margin,
+                bank.manner[e, i][0],
+                pick_up,
             )
             if gap < FAR:
+                near = 0.5 * speed
+                if style[0] > 0.0:
+                    near = near + 0.25 * speed * speed  # who has priority does not insist on it
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first)
+                at_line = bool(False)
+                if judgement[1] > 0.0:
+                    goes_first = True  # an error: it does not look who has priority
                 if not goes_first and line > -1.0 and not walks and speed * speed < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
@@ -625,10 +694,19 @@ def react_to_agents(
                     entered = is_in_junction(perceived, b, j)
                     crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
                     if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
-                        gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
+                        at_line = wp.max(line, 0.0) + 1.0 < gap
+                        if style[0] > 0.0 and speed * speed > 3.0 * style[3] * (line + 0.5):
+                            at_line = bool(False)  # rolls beyond the line: stops where the conflict is
+                        else:
+                            gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < 0.5 * speed and wp.abs(perceived.speed[b, j]) > STANDS):
-                    react = wp.min(react, idm_gap(speed, 0.0, gap))
+                if not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS):
+                    if at_line and style[0] > 0.0:
+                        react = wp.min(react, driver_stops(speed, gap, style))
+                    elif style[0] > 0.0:
+                        react = wp.min(react, driver_yields(speed, gap, style))
+                    else:
+                        react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)
         slot = slot + workers
