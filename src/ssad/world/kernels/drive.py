@@ -24,6 +24,7 @@ from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
 HALTED = wp.constant(0.1)  # m/s
 NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
+SHOCK = wp.constant(2.0)  # m/s^2 of it to which also one who brakes has to react
 EASES = wp.constant(0.4)  # m/s^2 of braking at the very end of a stop
 
 
@@ -116,7 +117,7 @@ def driven_acceleration(bank: EpisodeArrays, state: State, b: int, i: int, e: in
         elif pending < manner[2]:
             pending = pending + dt
             demand = -style[3]
-    elif demand < last - NOTICED and last > -NOTICED:
+    elif demand < last - NOTICED and (last > -NOTICED or demand < last - SHOCK):
         # the foot leaves the throttle at once, and then reaches the brake
         if pending < delay(manner[2], speed):
             pending = pending + dt

@@ -21,7 +21,9 @@ FIRM = wp.constant(3.0)  # m/s^2: harder braking is no ordinary stop
 HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
 ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who starts or creeps
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
-YIELD_ROOM = wp.constant(0.8)  # m of a conflict's margins in which a driver still stops
+LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
+YIELD_GAP = wp.constant(0.5)  # m before a conflict at which a driver comes to rest
+YIELD_ROOM = wp.constant(0.8)  # m of its margins in which also a driver who is late stops
 SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
 SAMPLES = wp.constant(8)  # points of the road ahead at which a driver looks for bends
 LOOKS = wp.constant(200.0)  # m
@@ -37,7 +39,7 @@ def driver_follows(v: float, lead: float, gap: float, style: wp.vec4) -> float:
     closing = v * (v - lead) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, v * style[0] + closing)) / wp.max(gap, 0.1)
     wish = style[2] * (1.0 - ratio * ratio)
-    room = wp.max(gap - 0.6 * style[1], 0.2)
+    room = wp.max(gap - LAST_GAP, 0.2)
     slower = wp.max(v - lead, 0.0)
     need = wp.max(slower * slower / (2.0 * room), v * v / (2.0 * (room + lead * lead / (2.0 * LEADER_BRAKES))))
     return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - style[2]
@@ -54,7 +56,9 @@ def driver_stops(v: float, distance: float, style: wp.vec4) -> float:
     share = need / style[3]
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
-        allowed = -need * wp.min(share, SMOOTH)
+        # who is late stops nearer to the place
+        late = v * v / (2.0 * wp.max(distance - LAST_GAP, 0.3))
+        allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if distance < style[1]:
         ratio = style[1] / wp.max(distance, 0.1)
         allowed = wp.min(allowed, wp.max(style[2] * (1.0 - ratio * ratio), -style[3]))
@@ -64,12 +68,13 @@ def driver_stops(v: float, distance: float, style: wp.vec4) -> float:
 @wp.func
 def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
-    need = v * v / (2.0 * (gap + YIELD_ROOM))
+    need = v * v / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
-        allowed = -need * wp.min(share, SMOOTH)
-    if gap < YIELD_ROOM:
+        late = v * v / (2.0 * (gap + YIELD_ROOM))
+        allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
+    if gap < 2.0 * YIELD_GAP:
         allowed = wp.min(allowed, -0.2 * style[3])
     return allowed - style[2]
 

@@ -8,7 +8,7 @@ predicted conflict that it must yield to (here).
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller, SignalState
-from ssad.world.kernels.belief import light
+from ssad.world.kernels.belief import extend_box, light
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
@@ -53,11 +53,15 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+FAR_SIGHT = wp.constant(120.0)  # m, of drivers of the population
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
+APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
+LONGER = wp.constant(6)  # strides beyond the forecast
+RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
 
@@ -101,6 +105,7 @@ def lead_gap(
     heading: wp.vec2,
     margin: float,
     bend: float,
+    sight: float,
 ) -> wp.vec2:
     """Locate the agent of row j on a route that begins `u0` metres along: (gap of bumpers or FAR, its speed).
 
@@ -108,7 +113,7 @@ def lead_gap(
     metres that the route ahead leaves its straight line.
     """
     other_pose = perceived.pose[b, j]
-    along = wp.clamp(lon, 0.0, SIGHT)
+    along = wp.clamp(lon, 0.0, sight)
     lateral = float(0.0)
     residual = float(0.0)
     frame = wp.vec4(0.0, 0.0, 1.0, 0.0)
@@ -120,7 +125,7 @@ def lead_gap(
         lateral = rel_y * frame[2] - rel_x * frame[3]
         if wp.abs(residual) < 0.05:
             break
-        along = wp.clamp(along + residual, 0.0, SIGHT)
+        along = wp.clamp(along + residual, 0.0, sight)
     cosine = heading[0] * frame[2] + heading[1] * frame[3]
     sine = wp.abs(heading[0] * frame[3] - heading[1] * frame[2])
     half_along = other_body[0] * wp.abs(cosine) + other_body[1] * sine
@@ -132,7 +137,7 @@ def lead_gap(
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
     if (
         along > 0.0
-        and along < SIGHT
+        and along < sight
         and wp.abs(residual) < 1.0
         and wp.abs(lateral) < own_body[1] + half_across + margin + sweep
     ):
@@ -297,6 +302,28 @@ def has_priority(
 
 
 @wp.func
+def looks_longer(rule: wp.vec4, offset: float, half: float, speed: float, style: wp.vec4) -> int:
+    """Return the strides beyond the forecast that a driver of the population looks ahead: before it crosses traffic."""
+    front = rule[2] - offset - half
+    crosses = int(rule[3]) != int(TurnRank.STRAIGHT) or speed < 3.0
+    extra = int(0)
+    if style[0] > 0.0 and rule[2] > 0.0 and front < APPROACH and crosses:
+        extra = LONGER
+    return extra
+
+
+@wp.func
+def forecast_pose(perceived: PerceivedAgents, b: int, j: int, index: int) -> wp.vec3:
+    """Return the pose of an agent `index` + 1 strides ahead; beyond its forecast it goes straight on."""
+    if index < HORIZON:
+        return perceived.forecast[b, j, index]
+    last = perceived.forecast[b, j, HORIZON - 1]
+    previous = perceived.forecast[b, j, HORIZON - 2]
+    strides = float(index - HORIZON + 1)
+    return wp.vec3(last[0] + strides * (last[0] - previous[0]), last[1] + strides * (last[1] - previous[1]), last[2])
+
+
+@wp.func
 def conflict_gap(
     roads: Roads,
     perceived: PerceivedAgents,
@@ -312,14 +339,16 @@ def conflict_gap(
     lat_margin: float,
     pace: float,
     pick_up: float,
-) -> float:
-    """Return the distance from i's front bumper to its predicted conflict with j within 4 s, or FAR.
+    extra: int,
+) -> wp.vec2:
+    """Return the distance from i's front bumper to its predicted conflict with j, or FAR, and the time until then, s.
 
     i is predicted along its intention, j along its own route at constant speed (along its heading if it has none);
     they are compared at the same time and half a second to either side. The distance is to the near edge of the
     conflict.
     """
     gap = FAR
+    first_time = FAR
     along = float(0.0)
     speed = v
     # Long enough that a fast, short agent does not skip from before the path to behind it.
@@ -328,7 +357,8 @@ def conflict_gap(
     squared_reach = reach * reach
     before = perceived.pose[b, j]
     now = perceived.forecast[b, j, 0]
-    for step in range(HORIZON):
+    strides = int(HORIZON) + extra
+    for step in range(strides):
         # it slows down for bends as the route's speed profile says
         route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
         next_speed = wp.min(
@@ -339,8 +369,8 @@ def conflict_gap(
         speed = next_speed
         frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         later = now
-        if step + 1 < HORIZON:
-            later = perceived.forecast[b, j, step + 1]
+        if step + 1 < strides:
+            later = forecast_pose(perceived, b, j, step + 1)
         for moment in range(3):
             other_pose = now
             if moment == 0:
@@ -366,16 +396,14 @@ def conflict_gap(
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
+                        first_time = wp.min(first_time, STRIDE * float(step))
         before = now
         now = later
-    return gap
+    return wp.vec2(gap, first_time)
 
 
 @wp.func
 def cannot_meet(
-    perceived: PerceivedAgents,
-    b: int,
-    j: int,
     pose: wp.vec3,
     c: float,
     s: float,
@@ -383,12 +411,12 @@ def cannot_meet(
     lat: float,
     ahead: float,
     off: float,
+    last_pose: wp.vec3,
 ) -> bool:
-    """Return whether j's next 4 s cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
+    """Return whether j's next seconds cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
 
-    lon, lat: place of j now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
+    lon, lat: place of j now; last_pose: its last one; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
     """
-    last_pose = perceived.forecast[b, j, HORIZON - 1]
     dx = last_pose[0] - pose[0]
     dy = last_pose[1] - pose[1]
     last_lon = dx * c + dy * s
@@ -476,8 +504,12 @@ def scan_agents(
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     # Range within which agents matter: 4 s of driving, and the distance of comfortable braking.
-    travel = wp.max(target, speed) * STRIDE * float(HORIZON)
-    view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), SIGHT)
+    extra = looks_longer(road_rule, offset, own_body[0], speed, style)
+    travel = wp.max(target, speed) * STRIDE * float(HORIZON + extra)
+    sight = float(SIGHT)
+    if style[0] > 0.0:
+        sight = FAR_SIGHT
+    view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), sight)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
     if is_changing_lane(shift):
@@ -502,6 +534,10 @@ def scan_agents(
     for j in range(from_row, to_row):
         if j != i and perceived.kind[b, j] != AgentKind.NONE:
             box = perceived.span[b, j]
+            last_pose = perceived.forecast[b, j, HORIZON - 1]
+            if extra > 0:
+                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
+                box = extend_box(box, last_pose)
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
                 other_half = perceived.half[b, j]
                 other_pose = perceived.pose[b, j]
@@ -531,7 +567,7 @@ def scan_agents(
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own_body[0] + other_half[0] + 2.0
                     if not cannot_meet(
-                        perceived, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
+                        pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach, last_pose
                     ):
                         flags = flags + 2
                 if flags > 0 and wp.abs(perceived.height[b, j] - perceived.height[b, i]) > BRIDGE:
@@ -621,14 +657,30 @@ def react_to_agents(
             if walks:
                 margin = 0.6
             bend = roads.bend[route[0] + state.progress[b, i]]
+            sight = float(SIGHT)
+            if style[0] > 0.0:
+                sight = FAR_SIGHT
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
             leader = lead_gap(
-                roads, perceived, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
+                roads,
+                perceived,
+                b,
+                j,
+                route,
+                shift,
+                aim[0],
+                longitudinal,
+                own_body,
+                other_half,
+                heading,
+                margin,
+                bend,
+                sight,
             )
             if leader[0] < FAR:
                 react = follow(speed, wp.max(leader[1], 0.0), judgement[0] * leader[0], style)
-                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, SIGHT)) * LEADERS + j)
+                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, sight)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
                 contact_range = NOSE_TO_NOSE
@@ -651,8 +703,19 @@ def react_to_agents(
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
-                if line > -1.0 and leader[0] > line + 3.0 and leader[0] < required_room and leader[1] < 1.5:
-                    react = wp.min(react, stop_before(speed, wp.max(line, 0.0) + 1.0, style))
+                # a driver of the population does not brake hard for it
+                late = style[0] > 0.0 and speed * speed > 3.0 * style[3] * (wp.max(line, 0.0) + 0.5)
+                if (
+                    line > -1.0
+                    and leader[0] > line + 3.0
+                    and leader[0] < required_room
+                    and leader[1] < 1.5
+                    and not late
+                ):
+                    if style[0] > 0.0:
+                        react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
+                    else:
+                        react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
         if flags >= 2 and leads == 0:
             margin = 0.4
             if walks:
@@ -660,7 +723,7 @@ def react_to_agents(
             pick_up = float(PICKS_UP)
             if style[0] > 0.0:
                 pick_up = 0.8 * style[2]
-            gap = conflict_gap(
+            conflict = conflict_gap(
                 roads,
                 perceived,
                 b,
@@ -675,11 +738,17 @@ def react_to_agents(
                 margin,
                 bank.manner[e, i][0],
                 pick_up,
+                looks_longer(row(roads.rule, first), offset, own_body[0], speed, style),
             )
+            gap = conflict[0]
             if gap < FAR:
                 near = 0.5 * speed
                 if style[0] > 0.0:
-                    near = near + 0.25 * speed * speed  # who has priority does not insist on it
+                    # who has priority relies on the other one as long as that one can stop
+                    other_speed = wp.abs(perceived.speed[b, j])
+                    near = 0.0
+                    if other_speed * (conflict[1] - other_speed / (2.0 * RELIES)) < 0.5:
+                        near = FAR
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first)
                 at_line = bool(False)
@@ -702,7 +771,7 @@ def react_to_agents(
                 # whoever stands and has to wait is not expected to go after all
                 if not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS):
                     if at_line and style[0] > 0.0:
-                        react = wp.min(react, driver_stops(speed, gap, style))
+                        react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
                     elif style[0] > 0.0:
                         react = wp.min(react, driver_yields(speed, gap, style))
                     else:
