@@ -145,7 +145,8 @@ class State:
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
-    pending: wp.array2d(dtype=wp.float32)  # [B, A] s for which a driver of the population has not reacted yet
+    # [B, A] of a driver of the population: s for which it has not reacted yet, and its reaction to others, m/s^2
+    pending: wp.array2d(dtype=wp.vec2)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
     lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
     touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent

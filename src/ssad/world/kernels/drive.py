@@ -17,7 +17,16 @@ from ssad.world.kernels.data import (
     Roads,
     State,
 )
-from ssad.world.kernels.drivers import FIRM, delay, driver_accelerates, is_lapsed, lane_place, pedal_change
+from ssad.world.kernels.drivers import (
+    FIRM,
+    HARDEST,
+    NOTICES,
+    delay,
+    driver_accelerates,
+    is_lapsed,
+    lane_place,
+    pedal_change,
+)
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
@@ -104,13 +113,19 @@ def steer_on_route(
 
 
 @wp.func
-def driven_acceleration(bank: EpisodeArrays, state: State, b: int, i: int, e: int, style: wp.vec4, dt: float) -> float:
+def driven_acceleration(
+    bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, style: wp.vec4, dt: float
+) -> float:
     """Return the acceleration to which a driver of the population comes in this step, m/s^2."""
     speed = state.speed[b, i]
     manner = bank.manner[e, i]
     last = state.accel[b, i]
-    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + state.react[b, i])
-    pending = state.pending[b, i]
+    pending = state.pending[b, i][0]
+    # predictions flicker from step to step: a driver sees them as one
+    reaction = state.pending[b, i][1]
+    reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
+    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + reaction)
+    junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:
         if demand <= 0.0:
             pending = 0.0
@@ -119,19 +134,21 @@ def driven_acceleration(bank: EpisodeArrays, state: State, b: int, i: int, e: in
             demand = -style[3]
     elif demand < last - NOTICED and (last > -NOTICED or demand < last - SHOCK):
         # the foot leaves the throttle at once, and then reaches the brake
-        if pending < delay(manner[2], speed):
+        if pending < delay(manner[2], speed, junction):
             pending = pending + dt
             demand = wp.min(last, 0.0)
     else:
         pending = 0.0
     if speed > HALTED and is_lapsed(bank.habit[e, i], float(state.step[b]) * dt):
         demand = wp.max(demand, last)
-    state.pending[b, i] = pending
+    state.pending[b, i] = wp.vec2(pending, reaction)
     if speed < 1.5 and demand > -FIRM:
         demand = wp.max(demand, -EASES - speed)  # comes to rest without a jolt
     accel = pedal_change(demand, last, manner[1], dt)
     if speed < HALTED and demand <= 0.0:
         accel = demand
+    if speed < 0.0:
+        accel = -style[3]  # the brake ends a way back
     return accel
 
 
@@ -231,7 +248,7 @@ def drive_one(
                 aside = lane_place(bank.habit[e, i], float(state.step[b]) * dt)
             steer = steer_on_route(bank, roads, state, b, i, e, speed, aside)
         if has_driver:
-            accel = driven_acceleration(bank, state, b, i, e, style, dt)
+            accel = driven_acceleration(bank, roads, state, b, i, e, style, dt)
         elif controller == Controller.AUTOPILOT:
             free = idm_free(speed, state.aim[b, i][1])
             accel = wp.min(free, state.react[b, i])

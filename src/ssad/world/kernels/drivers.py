@@ -19,18 +19,21 @@ RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal
 SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
 FIRM = wp.constant(3.0)  # m/s^2: harder braking is no ordinary stop
 HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
-ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who starts or creeps
+ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
+PREPARED = wp.constant(25.0)  # m before a junction from which a driver is ready to brake
+NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
+HARDEST = wp.constant(9.0)  # m/s^2
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
 LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
-YIELD_GAP = wp.constant(0.5)  # m before a conflict at which a driver comes to rest
-YIELD_ROOM = wp.constant(0.8)  # m of its margins in which also a driver who is late stops
+YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
+YIELD_LEAST = wp.constant(0.4)  # m before it at which a driver stops who is late
 SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
 SAMPLES = wp.constant(8)  # points of the road ahead at which a driver looks for bends
 LOOKS = wp.constant(200.0)  # m
 DRIFT = wp.constant(20.0)  # s over which the judgement of gaps changes
 LAPSE = wp.constant(2.0)  # s of an error
 SWERVE = wp.constant(6.0)  # s over which the place in the lane changes
-WANDER = wp.constant(0.1)  # m of it
+WANDER = wp.constant(0.05)  # m of it
 
 
 @wp.func
@@ -72,9 +75,9 @@ def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
     share = need / style[3]
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
-        late = v * v / (2.0 * (gap + YIELD_ROOM))
+        late = v * v / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
-    if gap < 2.0 * YIELD_GAP:
+    if gap < YIELD_GAP + 0.5:
         allowed = wp.min(allowed, -0.2 * style[3])
     return allowed - style[2]
 
@@ -144,9 +147,12 @@ def lane_place(habit: wp.vec3, time: float) -> float:
 
 
 @wp.func
-def delay(reaction_time: float, speed: float) -> float:
-    """Return the time until a driver at that speed begins to brake, s."""
-    return reaction_time * wp.clamp(speed / CRUISES, ATTENTIVE, 1.0)
+def delay(reaction_time: float, speed: float, junction: float) -> float:
+    """Return the time until a driver begins to brake, s; junction: m to the next one, 0 inside."""
+    share = wp.clamp(speed / CRUISES, ATTENTIVE, 1.0)
+    if junction < PREPARED:
+        share = ATTENTIVE
+    return reaction_time * share
 
 
 @wp.func

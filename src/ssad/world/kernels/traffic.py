@@ -746,7 +746,6 @@ def react_to_agents(
                 if style[0] > 0.0:
                     # who has priority relies on the other one as long as that one can stop
                     other_speed = wp.abs(perceived.speed[b, j])
-                    near = 0.0
                     if other_speed * (conflict[1] - other_speed / (2.0 * RELIES)) < 0.5:
                         near = FAR
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)

@@ -33,7 +33,7 @@ _HEAVY = 0.7  # times the acceleration of a car, of trucks and buses
 _REACTION = (0.75, 0.2, 0.4, 1.3)  # s: mean, spread and limits, of events that a driver expects
 _ERROR = (0.05, 0.02, 0.01, 0.1)  # relative error of gaps
 _JERK = (2.6, 0.4, 1.8, 3.6)  # m/s^3
-_OFFSET = 0.12  # m of spread between the places of drivers in their lanes
+_OFFSET = 0.06  # m of spread between the places of drivers in their lanes
 
 
 @cache
@@ -84,7 +84,7 @@ def draw_driver(kind: AgentKind, *key: object, errors: float = 0.0) -> DriverSty
         jerk=_truncated(random, *_JERK),
         reaction_time=_truncated(random, *_REACTION),
         estimation_error=_truncated(random, *_ERROR),
-        lane_offset=0.0 if heavy else _truncated(random, 0.0, _OFFSET, -0.25, 0.25),
+        lane_offset=0.0 if heavy else _truncated(random, 0.0, _OFFSET, -0.12, 0.12),
         errors=errors,
         key=int(random.integers(0, 1 << 23)),
     )
