@@ -17,12 +17,13 @@ LEADER_BRAKES = wp.constant(4.0)  # m/s^2 that a driver reckons a leader may bra
 STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Rothery 1962: between 2.44 and 3.66)
 RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
 SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
-FIRM = wp.constant(3.0)  # m/s^2: harder braking is no ordinary stop
+FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
 HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
 ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
 PREPARED = wp.constant(25.0)  # m before a junction from which a driver is ready to brake
 NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
 HARDEST = wp.constant(9.0)  # m/s^2
+CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
 LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
 YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
@@ -76,6 +77,8 @@ def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
         late = v * v / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
+        if v < CREEPS:
+            late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
         allowed = wp.min(allowed, -0.2 * style[3])
