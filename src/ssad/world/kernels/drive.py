@@ -30,9 +30,9 @@ from ssad.world.kernels.drivers import (
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
-
 HALTED = wp.constant(0.1)  # m/s
 NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
+STARTS = wp.constant(0.15)  # m/s^2: for less nobody starts
 SHOCK = wp.constant(2.0)  # m/s^2 of it to which also one who brakes has to react
 EASES = wp.constant(0.4)  # m/s^2 of braking at the very end of a stop
 
@@ -127,8 +127,9 @@ def driven_acceleration(
     demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + reaction)
     junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:
-        if demand <= 0.0:
+        if demand <= STARTS:
             pending = 0.0
+            demand = wp.min(demand, -STARTS)
         elif pending < manner[2]:
             pending = pending + dt
             demand = -style[3]
