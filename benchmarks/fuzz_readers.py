@@ -8,7 +8,9 @@ A reader may return, or raise an SSADError of one line. Every other error counts
 than 10 s of the processor or 2 GiB. A mutation depends only on the seed, the name of the reader and its index, so each
 can be repeated.
 Bytes are mutated (bits, cuts, insertions, repetitions), and so are the tokens of texts, the values of JSON and YAML,
-elements and attributes of XML, arrays of npz files, headers of safetensors and members of zip files.
+elements and attributes of XML, arrays of npz files, headers of safetensors, members of zip files and nodes of ONNX
+graphs. Readers whose package is not installed are left out, with a line. Scenic programs have no entry: they are Python
+code, which runs.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import importlib.util
 import io
 import json
 import multiprocessing
@@ -33,6 +36,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -40,6 +44,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ssad.core.errors import SSADError
+from ssad.core.import_report import ImportReport
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS, MEMORY_BYTES = 10.0, 2 << 30
@@ -83,11 +88,18 @@ class Reader:
         make: Writes valid files into an empty folder and returns those that are mutated, by path.
         read: Reads the files of the folder.
         is_single: Whether each file stands alone, so that the others need not be read again.
+        package: Package without which the reader refuses every file.
     """
 
     make: Callable[[Path], Sequence[Path]]
     read: Callable[[Path], object]
     is_single: bool = False
+    package: str = ""
+
+    @property
+    def is_available(self) -> bool:
+        """Whether its package is installed."""
+        return not self.package or importlib.util.find_spec(self.package) is not None
 
 
 @dataclass
@@ -299,15 +311,53 @@ def change_zip(draw: random.Random, content: bytes) -> bytes:
     return buffer.getvalue()
 
 
+def change_onnx(draw: random.Random, content: bytes) -> bytes:
+    """Return an ONNX file with one or two nodes, attributes, weights or shapes replaced or removed."""
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    graph = model.graph
+    for _ in range(draw.choice((1, 1, 2))):
+        node, weights = draw.choice(graph.node), draw.choice(graph.initializer)
+        action = draw.randrange(9)
+        if action == 0:
+            node.op_type = draw.choice(("", "Loop", "Resize", "NonMaxSuppression", "a" * 500, *OPERATORS))
+        elif action == 1:
+            graph.node.remove(node)
+        elif action == 2 and node.input:
+            node.input[draw.randrange(len(node.input))] = draw.choice(
+                ("", "none", *(one.output[0] for one in graph.node))
+            )
+        elif action == 3 and node.attribute:
+            attribute = draw.choice(node.attribute)
+            attribute.ints[:] = [draw.choice((-1, 0, 1, 2, 7, 2**31, 2**62)) for _ in range(draw.randrange(5))]
+        elif action == 4:
+            weights.dims[:] = [draw.choice((-1, 0, 1, 3, 7, 2**31, 2**62)) for _ in range(draw.randrange(6))]
+        elif action == 5:
+            weights.raw_data = change_bytes(draw, weights.raw_data)
+        elif action == 6:
+            weights.data_type = draw.randrange(25)
+        elif action == 7:
+            shape = draw.choice((graph.input[0], graph.output[0])).type.tensor_type.shape
+            if shape.dim:
+                draw.choice(shape.dim).dim_value = draw.choice((-1, 0, 1, 3, 64, 2**31, 2**62))
+        else:
+            model.opset_import[0].version = draw.choice((-1, 0, 1, 7, 13, 30, 2**40))
+    return bytes(model.SerializeToString())
+
+
+OPERATORS = ("Add", "Cast", "Concat", "Conv", "Gather", "Reshape", "Sigmoid", "Slice", "Split", "Transpose")
 CHANGES: dict[str, tuple[Change, ...]] = {
     ".json": (change_json, change_json, change_tokens, change_bytes),
     ".jsonl": (change_json, change_json, change_tokens, change_bytes),
     ".yaml": (change_yaml, change_yaml, change_tokens, change_bytes),
     ".xml": (change_xml, change_xml, change_tokens, change_bytes),
     ".xodr": (change_xml, change_xml, change_tokens, change_bytes),
+    ".osm": (change_xml, change_xml, change_tokens, change_bytes),
     ".xosc": (change_xml, change_xml, change_tokens, change_bytes),
     ".npz": (change_npz, change_npz, change_zip, change_bytes),
     ".safetensors": (change_safetensors, change_bytes),
+    ".onnx": (change_onnx, change_onnx, change_bytes),
     ".pth": (change_zip, change_bytes),
     ".obj": (change_tokens, change_bytes),
     ".mtl": (change_tokens, change_bytes),
@@ -371,6 +421,27 @@ def _read_map(folder: Path) -> object:
     from ssad.world.roads.bake import import_map
 
     return import_map(folder / "map.xodr", "a", folder.with_name("home"))
+
+
+def _lanelet_map(folder: Path) -> Sequence[Path]:
+    from helpers.lanelet_maps import MapWriter, crossing_map
+
+    crossing = crossing_map()
+    post = crossing.way([(0.0, 70.0), (0.0, 71.0)], type="traffic_sign", subtype="de274-60")
+    limit = crossing.rule("speed_limit", [("refers", post)])
+    crossing.lanelet([(-6.0, 10.0), (-6.0, 60.0)], [(-2.0, 10.0), (-2.0, 60.0)], limit, region="de", one_way="yes")
+    crossing.lanelet([(-9.0, 30.0), (9.0, 30.0)], [(-9.0, 27.0), (9.0, 27.0)], subtype="crosswalk")
+    degrees = MapWriter(local=False)
+    degrees.lanelet([(8.4, 49.00002), (8.401, 49.00002)], [(8.4, 49.0), (8.401, 49.0)], speed_limit="30 km/h")
+    return [crossing.write(folder / "crossing.osm"), degrees.write(folder / "degrees.osm")]
+
+
+def _read_lanelet_maps(folder: Path) -> object:
+    from ssad.world.roads import import_map
+
+    for path in folder.glob("*.osm"):
+        import_map(path, "a", folder.with_name("home"))
+    return None
 
 
 def _scenarios() -> Sequence[Any]:
@@ -462,7 +533,7 @@ def _routes(folder: Path) -> Sequence[Path]:
 def _read_routes(folder: Path) -> object:
     from ssad.scenarios.dynamic import import_routes
 
-    return import_routes(folder, omissions=[])
+    return import_routes(folder, report=ImportReport(str(folder)))
 
 
 def _suite(folder: Path) -> Sequence[Path]:
@@ -771,10 +842,194 @@ def _read_gltf(folder: Path) -> object:
     return read_gltf(folder / "a.gltf")
 
 
+def _safetensors(folder: Path) -> Sequence[Path]:
+    import torch
+
+    from ssad.core.checkpoints import WeightsCard, save_weights
+
+    state = {"a.weight": torch.arange(12.0).reshape(3, 4), "b.weight": torch.ones(4, 2), "b.bias": torch.zeros(3)}
+    card = WeightsCard("a", "b", 0, ("car",), {"AP50": 0.5}, {"width": 3}, "")
+    save_weights(folder / "whole.safetensors", state, card=card)
+    save_weights(folder / "parts.safetensors", state, card=card, shard_mb=1e-4)
+    parts = sorted(path.name for path in folder.glob("parts-*.safetensors"))
+    weight_map = dict(zip(state, [*parts, *parts], strict=False))
+    (folder / "model.index.json").write_text(json.dumps({"metadata": {}, "weight_map": weight_map}))
+    return sorted(folder.iterdir())
+
+
+def _read_safetensors(folder: Path) -> object:
+    from ssad.core.checkpoints import load_card, load_weights
+
+    whole, parts = load_card(folder / "whole.json"), load_card(folder / "parts.json")
+    return whole, parts, load_weights(folder / "whole.safetensors"), load_weights(folder / "model.index.json")
+
+
+def _onnx(folder: Path) -> Sequence[Path]:
+    """A detector with the output of YOLOv8: boxes and three classes at 126 places of images of 64 x 96."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    generator = np.random.default_rng(0)
+    nodes, weights = [], [numpy_helper.from_array(np.array([1, 7, -1], np.int64), "shape")]
+    for stride in (8, 16, 32):
+        kernel = generator.normal(size=(7, 3, stride, stride)).astype("<f4") / stride
+        weights.append(numpy_helper.from_array(kernel, f"kernel{stride}"))
+        options = {"kernel_shape": [stride, stride], "strides": [stride, stride]}
+        nodes += [
+            helper.make_node("Conv", ["images", f"kernel{stride}"], [f"map{stride}"], **options),
+            helper.make_node("Sigmoid", [f"map{stride}"], [f"share{stride}"]),
+            helper.make_node("Reshape", [f"share{stride}", "shape"], [f"rows{stride}"]),
+        ]
+    nodes.append(helper.make_node("Concat", ["rows8", "rows16", "rows32"], ["rows"], axis=2))
+    weights.append(numpy_helper.from_array(np.array([[[4], [4], [64], [64], [1], [1], [1]]], np.float32), "scale"))
+    centres = np.zeros((1, 7, 126), np.float32)
+    places = [
+        (x * stride, y * stride) for stride in (8, 16, 32) for y in range(64 // stride) for x in range(96 // stride)
+    ]
+    centres[0, :2] = np.transpose(places)
+    weights.append(numpy_helper.from_array(centres, "centres"))
+    nodes.append(helper.make_node("Mul", ["rows", "scale"], ["scaled"]))
+    nodes.append(helper.make_node("Add", ["scaled", "centres"], ["output"]))
+    images, output = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+        for name, shape in (("images", [1, 3, 64, 96]), ("output", [1, 7, 126]))
+    )
+    graph = helper.make_graph(nodes, "a", [images], [output], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
+    onnx.save(model, folder / "a.onnx")
+    return [folder / "a.onnx"]
+
+
+def _read_onnx(folder: Path) -> object:
+    import torch
+
+    from ssad.detectors.adapters.onnx_detector import onnx_detector
+
+    detector = onnx_detector(folder / "a.onnx", classes=["car", "person", "bus"])
+    return detector.predict(torch.zeros(1, 3, 64, 96))
+
+
+def _darknet(folder: Path) -> Sequence[Path]:
+    import torch
+
+    from ssad.detectors import make_detector
+    from ssad.detectors.yolo.darknet import convolutions
+
+    torch.manual_seed(0)
+    tensors = [tensor for layer in convolutions(make_detector("yolov3-tiny", weights="random"))[:2] for tensor in layer]
+    values = b"".join(tensor.detach().numpy().astype("<f4").tobytes() for tensor in tensors)
+    (folder / "a.weights").write_bytes(np.array([0, 2, 5], "<i4").tobytes() + np.array([7], "<i8").tobytes() + values)
+    return [folder / "a.weights"]
+
+
+@cache
+def _tiny_yolo() -> Any:
+    from ssad.detectors import make_detector
+
+    return make_detector("yolov3-tiny", weights="random")
+
+
+def _read_darknet(folder: Path) -> object:
+    from ssad.detectors.yolo.darknet import read_darknet
+
+    return read_darknet(_tiny_yolo(), folder / "a.weights", layers=2)
+
+
+def _texture(folder: Path) -> Sequence[Path]:
+    import torch
+
+    from ssad.rendering.target import parse_target
+    from ssad.scenarios.static.physical import make_carrier
+    from ssad.scenarios.static.physical.textures.export import PrintedTexture, export_texture
+
+    options = {"width": 0.6, "height": 0.3, "panel": "rear"}
+    size = make_carrier("patch", options).on(parse_target("sedan:silver:0").mesh()).size
+    texture = PrintedTexture(torch.full((3, *size), 0.25), "patch", options, "sedan:silver:0")
+    export_texture(folder, texture, dots=50, name="a")
+    return [folder / "texture.json", folder / "texture.npz"]
+
+
+def _light(folder: Path) -> Sequence[Path]:
+    import torch
+
+    from ssad.scenarios.static.physical.lights import make_light
+    from ssad.scenarios.static.physical.lights.export import LightSetup, export_light
+    from ssad.scenarios.static.physical.lights.light import TargetSize
+
+    ranges = make_light("flashlight", {}).ranges(TargetSize(4.9, 2.06, 1.51))
+    values = {name: low + 0.5 * (high - low) for name, (low, high) in ranges.items()}
+    target = "sedan:black:0"
+    export_light(folder / "flashlight", LightSetup("flashlight", {}, "night", target, values))
+    size = make_light("projector", {"lumens": 800.0}).surface(TargetSize(4.9, 2.06, 1.51)).size
+    picture = torch.full((3, *size), 0.5)
+    export_light(folder / "projector", LightSetup("projector", {"lumens": 800.0}, "night", target, {}, picture))
+    return [*folder.glob("*/light.json"), folder / "projector" / "picture.npz"]
+
+
+def _read_exports(folder: Path) -> object:
+    """Read exports of textures and lights, and put them on their target."""
+    from ssad.rendering.target import parse_target
+    from ssad.scenarios.static.physical.lights.export import load_exported_attack
+
+    edits = []
+    for file in (*folder.glob("*/light.json"), *folder.glob("texture.json")):
+        attack = load_exported_attack(file.parent)
+        edits.append((attack.edit(parse_target(attack.target).mesh()), attack.live(1)))
+    return edits
+
+
+def _shifted(folder: Path) -> Sequence[Path]:
+    from ssad.recorders.shifted import Options, write_shifted_roots
+
+    _nuscenes(folder / "clean", samples=2)
+    (written,) = write_shifted_roots(Options(folder / "clean", folder / "out", "v1.0-mini", ("fog",), (3,)), workers=0)
+    return [written.root / "manifest.json", *sorted((written.root / "manifest").glob("*.json*"))]
+
+
+def _read_shifted(folder: Path) -> object:
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.recorders.shifted import check_manifest, verify
+    from ssad.recorders.shifted.manifest import read_lines
+    from ssad.recorders.shifted.scene_writer import read_finished_labels
+
+    root = folder / "out" / "fog-3"
+    with NuScenes(root) as data:
+        names = [scene.name for scene in data.scenes()]
+    lines = [read_lines(root / "manifest" / f"{name}.jsonl") for name in names]
+    return lines, [read_finished_labels(root, name) for name in names], verify(root), check_manifest(root, names)
+
+
+def _older_commonroad(folder: Path) -> Sequence[Path]:
+    """Version 2018b of the file of `_commonroad`, and protobuf as commonroad-io writes it."""
+    from commonroad.common.file_reader import CommonRoadFileReader
+    from commonroad.common.file_writer import CommonRoadFileWriter
+    from commonroad.common.util import FileFormat
+    from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
+
+    from ssad.interchange.export import export_commonroad
+
+    (file, *_), _ = export_commonroad(_scenarios()[:1], folder.with_name("new"), system="autopilot")
+    text = file.read_text()
+    content, problems = CommonRoadFileReader(str(file)).open()
+    writer = CommonRoadFileWriter(content, problems, "", "", "", set(), file_format=FileFormat.PROTOBUF)
+    writer.write_to_file(str(folder / "a.pb"), OverwriteExistingFile.ALWAYS)
+    text = text.replace('commonRoadVersion="2020a"', 'commonRoadVersion="2018b" tags="highway"')
+    text = re.sub(r'<(dynamic|static)Obstacle id="(\d+)">', r'<obstacle id="\2"><role>\1</role>', text)
+    (folder / "a.xml").write_text(re.sub(r"</(?:dynamic|static)Obstacle>", "</obstacle>", text))
+    return [folder / "a.pb", folder / "a.xml"]
+
+
+def _read_older_commonroad(folder: Path) -> object:
+    from ssad.interchange.commonroad_reader import read_commonroad
+
+    return _read_each(folder, read_commonroad)
+
+
 READERS: dict[str, Reader] = {
     "suite": Reader(_suite, _read_suite),
     "scenarios": Reader(_scenario_file, _read_scenario_file),
     "map": Reader(_map, _read_map),
+    "lanelet2": Reader(_lanelet_map, _read_lanelet_maps),
     "town": Reader(_graph, _read_graph),
     "openscenario": Reader(_openscenario, _read_openscenario),
     "commonroad": Reader(_commonroad, _read_commonroad),
@@ -795,6 +1050,13 @@ READERS: dict[str, Reader] = {
     "images": Reader(_images, _read_images, is_single=True),
     "obj": Reader(_mesh, _read_mesh),
     "gltf": Reader(_gltf, _read_gltf),
+    "safetensors": Reader(_safetensors, _read_safetensors),
+    "onnx": Reader(_onnx, _read_onnx, package="onnx2torch"),
+    "darknet": Reader(_darknet, _read_darknet),
+    "texture": Reader(_texture, _read_exports),
+    "light": Reader(_light, _read_exports),
+    "shifted": Reader(_shifted, _read_shifted),
+    "older-commonroad": Reader(_older_commonroad, _read_older_commonroad, is_single=True, package="commonroad"),
 }
 
 
@@ -899,6 +1161,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.path.insert(0, str(ROOT / "tests"))  # helpers that make valid files
     failed = 0
     for name in options.reader or READERS:
+        if not READERS[name].is_available:
+            print(f"{name}: not run: the package {READERS[name].package} is not installed", flush=True)
+            continue
         indices = range(options.count) if options.index is None else [options.index]
         began = time.perf_counter()
         # A process of its own: a crash of native code ends one reader, not the run.

@@ -173,8 +173,12 @@ def test_detect_takes_a_folder_of_photographs_upright_and_whole(mine: Path, phot
 def test_show_takes_photographs_upright_and_whole(photographs: Path, tmp_path: Path) -> None:
     done = ssad("show", photographs, tmp_path / "page")
     assert done.returncode == 1
-    assert f"page: {tmp_path / 'page' / 'index.html'} (5 of 7 pictures and point clouds)\n" in done.stdout
+    first_line = f"page: {tmp_path / 'page' / 'index.html'} (5 of 7 pictures and point clouds)"
+    assert " ".join(done.stdout.split()).startswith(first_line)
     assert "not read: broken.png: not a JPEG, PNG" in done.stdout
+    report = " ".join((tmp_path / "page" / "index.import.txt").read_text().split())
+    assert "not carried over: files that are neither pictures nor point clouds: .txt: notes.txt" in report
+    assert "doubtful: not read: a symbolic link that leads out of" in report
     page = (tmp_path / "page" / "index.html").read_text()
     for text in (
         "turned.jpg: 120 x 200; turned upright (EXIF orientation 6)",
@@ -275,6 +279,7 @@ def test_detect_on_a_data_set_writes_what_score_reads(tiny_set: Path, tmp_path: 
 def test_show_has_every_camera_and_the_lidar_of_each_moment(tiny_set: Path, tmp_path: Path) -> None:
     done = ssad("show", tiny_set, tmp_path / "page", "--samples", "1")
     assert done.returncode == 0, done.stderr
+    assert "nuScenes schema" in (tmp_path / "page" / "index.import.txt").read_text()
     page = (tmp_path / "page" / "index.html").read_text()
     named = re.findall(r'src="(pictures/[^"]+)"', page)
     assert len(named) == len(set(named)) == 2 * (page.count("<figcaption>CAM_") // 2 + 1)

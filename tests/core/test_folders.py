@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 from helpers.descriptors import open_files
 
-from ssad.core.errors import StoreError
+from ssad.core.errors import ConfigError, StoreError
 from ssad.core.folders import (
     check_links_above,
     check_output_folder,
     check_tree,
+    data_path,
     is_file_name,
     open_inside,
     path_inside,
@@ -52,6 +53,34 @@ def test_links_that_lead_out_are_refused_and_others_followed(run: Path) -> None:
             path_inside(run, name)
     with pytest.raises(StoreError, match="circle"):
         path_inside(run, "circle")
+
+
+def test_links_of_data_lead_to_folders_that_the_user_allows(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (run / "outer").symlink_to("../victim")
+    victim = run.parent / "victim"
+    for folders in ("", str(victim / "other"), "/nowhere", f"{victim}x"):
+        monkeypatch.setenv("SSAD_DATA_LINKS", folders)
+        with pytest.raises(StoreError, match=f"outer/file: leads out of .*SSAD_DATA_LINKS={victim}$"):
+            data_path(run, "outer/file")
+    for folders in (str(victim), f"/nowhere:{victim.parent}"):
+        monkeypatch.setenv("SSAD_DATA_LINKS", folders)
+        assert data_path(run, "outer/file") == run / "outer" / "file"
+        with pytest.raises(StoreError, match="is no path below"):
+            data_path(run, "../victim/file")
+        with pytest.raises(StoreError, match="leads out of"):
+            path_inside(run, "outer/file")
+    monkeypatch.setenv("SSAD_DATA_LINKS", "disk")
+    with pytest.raises(ConfigError, match="disk is no absolute path"):
+        data_path(run, "outer/file")
+
+
+def test_links_of_a_changed_copy_lead_to_the_same_name_of_its_source(run: Path) -> None:
+    source = run.parent / "victim"
+    (run / "file").symlink_to("../victim/file")
+    (run / "other").symlink_to("../victim/file")
+    assert data_path(run, "file", source=source) == run / "file"
+    with pytest.raises(StoreError, match="other: leads out of"):
+        data_path(run, "other", source=source)
 
 
 def test_a_root_that_is_a_link_is_the_users_own(run: Path, tmp_path: Path) -> None:

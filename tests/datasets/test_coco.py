@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.core.errors import FormatError
+from ssad.core.errors import FormatError, StoreError
+from ssad.core.import_report import ImportReport
 from ssad.datasets.coco import coco_data, read_coco
 
 CLASSES = ("car", "bus")
@@ -70,6 +71,27 @@ def test_pictures_are_found_beside_the_page_or_where_one_says(tmp_path: Path) ->
     (tmp_path / "images").mkdir()
     assert read_coco(page).images[1].file == tmp_path / "images" / "sub" / "b.jpg"
     assert read_coco(page, images=tmp_path / "else").images[0].file == tmp_path / "else" / "a.jpg"
+
+
+def test_pictures_do_not_lead_out_of_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    outside, folder = tmp_path / "outside", tmp_path / "set"
+    page = write(folder, coco_data(CLASSES, ROWS, {}))
+    (folder / "images").mkdir()
+    outside.mkdir()
+    for name in ("images/a.jpg", "images/sub", "images"):
+        path = folder / name
+        if path.is_dir():
+            path.rename(tmp_path / "images")
+        path.symlink_to(outside)
+        with pytest.raises(StoreError, match=f"{name}: leads out of|{name}/b.jpg: leads out of"):
+            read_coco(page)
+        with monkeypatch.context() as patch:
+            patch.setenv("SSAD_DATA_LINKS", str(outside))
+            assert len(read_coco(page).images) == 2
+        path.unlink()
+    (folder / "images" / "sub").mkdir(parents=True)
+    (folder / "images" / "a.jpg").symlink_to("sub/c.jpg")
+    assert len(read_coco(page).images) == 2
 
 
 def test_ids_with_gaps_and_in_any_order_as_in_coco_itself(tmp_path: Path) -> None:
@@ -159,6 +181,23 @@ def test_a_broken_page_is_refused_in_one_line(
         read_coco(page)
     assert "\n" not in str(error.value)
     assert str(error.value).startswith(str(page))
+
+
+def test_a_report_names_what_is_left_out_of_annotations(tmp_path: Path) -> None:
+    """Boxes without height, as in COCO's own files, and annotations of no image are left out of the others."""
+    data = copy.deepcopy(coco_data(CLASSES, ROWS, {}))
+    count = len(data["annotations"])
+    data["annotations"][0] |= {"bbox": [1, 2, 3, 0], "segmentation": [[1, 2, 3, 4, 5, 6]]}
+    data["annotations"][1] |= {"image_id": 99}
+    report = ImportReport("page")
+    found = read_coco(write(tmp_path, data), report=report)
+    assert sum(len(image.box) for image in found.images) == count - 2
+    assert report.doubts == {
+        "boxes without width or height are left out": ["annotation 0"],
+        "annotations of no image or category are left out": ["annotation 1"],
+    }
+    assert report.omissions == {"segmentation of annotations": [""]}
+    assert report.contents == [f"{len(ROWS)} pictures with {count - 2} boxes of {len(CLASSES)} classes"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"images": 1}', "\x00", '{"images": [NaN'])

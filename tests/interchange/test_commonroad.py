@@ -12,6 +12,7 @@ import pytest
 from helpers.command import ssad
 from helpers.generated import generated
 
+from ssad.core.import_report import ImportReport
 from ssad.core.types import Actor, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalPlan
 from ssad.drivers import make_system
 from ssad.interchange.commonroad_reader import read_commonroad
@@ -38,8 +39,10 @@ def built(scenarios: Sequence[Scenario]) -> list[Episode]:
 
 def returned(scenarios: Sequence[Scenario], folder: Path, system: str) -> list[Scenario]:
     files, _ = export_commonroad(scenarios, folder, system=system)
-    found = [read_commonroad(path) for path in files]
-    assert all(one.is_known_town and not one.omissions for one in found)
+    reports = [ImportReport(str(path)) for path in files]
+    found = [read_commonroad(path, report=report) for path, report in zip(files, reports, strict=True)]
+    assert all(one.is_known_town for one in found)
+    assert not any(report.omissions or report.doubts or report.notes for report in reports)
     return [one.scenario for one in found]
 
 
@@ -239,12 +242,33 @@ def test_a_scenario_of_others_is_driven(tmp_path: Path, monkeypatch: pytest.Monk
     assert (walker.model, walker.trajectory[-1][:3]) == ("walker", (2.0, 101.0, -6.0))
     assert (found.limits.max_steps, found.parameters["ego_speed"], found.target_speed) == (120, 12.0, 12.0)
     for line in ("the earliest time of the goal", "occupancy sets: their middles", "car (4.5 x 1.9 m) becomes 'suv'"):
-        assert line in done.stdout
+        assert line in " ".join(done.stdout.split())
+    assert "2 lanelets" in done.stdout
+    assert max(map(len, done.stdout.replace(str(tmp_path), "").splitlines())) <= 80
+    report = (tmp_path / "us.import.txt").read_text()
+    assert set(done.stdout.splitlines()[2:-1]) <= set(report.splitlines())
     (episode,) = built([found])
     assert episode.agents[0].route.xy[-1, 1] == pytest.approx(3.5)
     (trace,) = drive([episode], "autopilot")
     assert trace.x[4, 2] == pytest.approx(43.2, abs=0.01)
     assert not trace.active[9:, 2].any()
+
+
+def test_strict_refuses_what_is_doubtful_and_stores_nothing(tmp_path: Path, ssad_home: Path) -> None:
+    """A stop sign of no lanelet, and a light of none."""
+    (tmp_path / "good.xml").write_text(FOREIGN)
+    assert ssad("import", "commonroad", tmp_path / "good.xml", tmp_path / "good.yaml", "--strict").returncode == 0
+    sign = (
+        '<trafficSign id="90"><trafficSignElement><trafficSignID>206</trafficSignID></trafficSignElement></trafficSign>'
+    )
+    light = '<trafficLight id="91"><cycle><cycleElement><duration>3</duration><color>red</color></cycleElement></cycle>'
+    text = FOREIGN.replace("<staticObstacle", f"{sign}{light}</trafficLight><staticObstacle", 1)
+    (tmp_path / "bad.xml").write_text(text)
+    done = ssad("import", "commonroad", tmp_path / "bad.xml", tmp_path / "bad.yaml", "--strict")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "signs that no lanelet refers to are left out: trafficSign 90, and 1 other doubts" in done.stderr
+    assert not (tmp_path / "bad.yaml").exists()
+    assert not (ssad_home / "towns" / "bad.npz").exists()
 
 
 def _cut(old: str, new: str = "") -> Callable[[str], str]:

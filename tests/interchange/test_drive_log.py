@@ -13,6 +13,7 @@ from helpers.command import ssad
 from helpers.sharing import Shared
 
 from ssad.core.errors import ConfigError, RouteError
+from ssad.core.import_report import ImportReport
 from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -168,6 +169,7 @@ def still(x: float, y: float) -> Place:
 
 
 def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
+    report = ImportReport("log")
     drive = opened(
         write(
             tmp_path,
@@ -178,7 +180,8 @@ def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
                 ("movable_object.trafficcone", (0.4, 0.4, 0.8), still(140.0, 53.0), [3]),
                 ("animal", (0.4, 0.8, 0.5), still(150.0, 55.0), [2, 3]),
             ],
-        )
+        ),
+        report=report,
     )
     actors = {actor.name: actor for actor in drive.scenario.actors}
     assert list(actors) == ["car-1", "adult-1", "adult-1-2", "trafficcone-1", "car-2"]
@@ -188,7 +191,9 @@ def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
     assert actors["adult-1-2"].trajectory == ((3.0, 130.0, 61.0, 0.3), (3.5, 130.0, 61.5, 0.3))
     assert actors["trafficcone-1"].trajectory == ((1.5, 140.0, 53.0, 0.3), (1.6, 140.0, 53.0, 0.3))
     assert actors["trafficcone-1"].model == "cone"
-    assert dict(drive.omissions) == {"animal": 1}
+    assert len(report.omissions["objects of category animal"]) == 1
+    assert report.notes["objects annotated in one key frame exist for 0.1 s"] == ["trafficcone-1"]
+    assert not report.doubts
     assert drive.scenario.target_speed == pytest.approx(8.0)
     assert drive.scenario.parameters == {"ego_speed": 8.0}
     first, *_, last = drive.scenario.route
@@ -210,10 +215,23 @@ def test_the_ego_starts_where_and_as_fast_as_in_the_log(tmp_path: Path) -> None:
 
 def test_the_nearest_are_kept_where_there_are_too_many(tmp_path: Path) -> None:
     far = [("movable_object.barrier", (2.0, 0.5, 1.0), still(104.0 + n, 60.0 + n), [0, 1]) for n in range(70)]
-    drive = opened(write(tmp_path, far[::-1]))
+    report = ImportReport("log")
+    drive = opened(write(tmp_path, far[::-1]), report=report)
     assert len(drive.scenario.actors) == 62
     assert max(actor.pose.y for actor in drive.scenario.actors) == 121.0
-    assert dict(drive.omissions) == {"too many (a scene has room for 62)": 8}
+    assert len(report.omissions["objects: a scene has room for 62, the nearest to the ego's path"]) == 8
+
+
+def test_an_object_that_jumps_is_doubtful_and_refused_by_strict(tmp_path: Path, ssad_home: Path) -> None:
+    jumping = ("vehicle.car", CAR, lambda t: (120.0 + 400.0 * t, 57.0), [1, 2])
+    root, report = write(tmp_path / "log", [jumping]), ImportReport("log")
+    opened(root, report=report)
+    assert report.doubts == {"an object moves faster than 70 m/s": ["car-1"]}
+    done = ssad("import", "drive", root, "--scene", "scene-1", tmp_path / "a.yaml", "--strict")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "an object moves faster than 70 m/s: car-1; correct the file" in done.stderr
+    assert not (tmp_path / "a.yaml").exists()
+    assert not (ssad_home / "towns" / "a.npz").exists()
 
 
 def test_who_appears_later_may_appear_where_the_ego_began(tmp_path: Path) -> None:
@@ -265,7 +283,9 @@ def test_the_command_writes_a_scenario_that_runs_and_its_town(foreign: Path, tmp
     done = ssad("import", "drive", foreign, "--version", "v1.0-ssad", "--scene", SCENE, out)
     assert done.returncode == 0, done.stderr
     (scenario,) = read_scenarios(out)
-    assert f"scenario log/{SCENE}: {len(scenario.actors)} actors in queenstown; written to {out}" in done.stdout
+    first_line = f"scenario log/{SCENE}: {len(scenario.actors)} actors in queenstown; written to {out}"
+    assert " ".join(done.stdout.split()).startswith(first_line)
+    assert "not carried over: pictures and point clouds" in (tmp_path / "queenstown.import.txt").read_text()
     with NuScenes(foreign) as data:
         assert scenario == scenario_of_drive(data, SCENE, town="queenstown").scenario
     assert scenario.source == f"nuScenes schema v1.0-ssad, {SCENE} in singapore-queenstown"

@@ -10,6 +10,7 @@ import pytest
 from helpers.command import ssad
 from helpers.generated import generated
 
+from ssad.core.import_report import ImportReport
 from ssad.core.types import Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1, read_leaderboard
@@ -38,8 +39,12 @@ def test_routes_come_back_as_the_same_drive(every: int, tmp_path: Path) -> None:
     assert any(actor.trajectory for s in made for actor in s.actors)
     scenarios = [*load_scenarios("precrash")[::every], *made]
     (path,), lost = export_leaderboard(scenarios, tmp_path)
-    found, nothing = read_leaderboard(path)
-    assert nothing == ("weather of a route" + (f" ({len(scenarios)} times)"),)
+    report = ImportReport("routes")
+    found = read_leaderboard(path, report=report)
+    assert {reason: len(places) for reason, places in report.omissions.items()} == {
+        "weather of a route": len(scenarios)
+    }
+    assert not report.doubts
     assert len(found) == len(scenarios) == (52 if every == 1 else 5)
     assert any(line.startswith("actors of a Custom: the leaderboard drives its ego alone") for line in lost)
     drives = []
@@ -56,13 +61,13 @@ def test_routes_come_back_as_the_same_drive(every: int, tmp_path: Path) -> None:
 def test_what_is_moved_in_the_file_is_moved(tmp_path: Path) -> None:
     """Whoever edits the written file gets what it says."""
     (path,), _ = export_leaderboard(load_scenarios("StraightObstacle/00"), tmp_path)
-    (before,), _ = read_leaderboard(path)
+    (before,) = read_leaderboard(path)
     assert before.trigger is not None
     text = path.read_text()
     old = f'<trigger_point x="{before.trigger.x:.3f}"'
     assert old in text
     path.write_text(text.replace(old, f'<trigger_point x="{before.trigger.x + 5.0:.3f}"'))
-    (after,), _ = read_leaderboard(path)
+    (after,) = read_leaderboard(path)
     assert after.trigger is not None
     assert after.trigger.x == pytest.approx(before.trigger.x + 5.0)
     assert (after.route, after.parameters) == (before.route, before.parameters)
@@ -106,7 +111,7 @@ def test_what_is_not_played_is_named(tmp_path: Path) -> None:
         "weather of a route",
         "speed of DynamicObjectCrossing",
     ):
-        assert f"not carried over: {line}" in done.stdout
+        assert f"not carried over: {line}" in " ".join(done.stdout.split())
 
 
 ALONE = """<?xml version="1.0"?><routes>
@@ -158,9 +163,25 @@ def test_routes_without_scenarios_are_free_drives_in_traffic(tmp_path: Path) -> 
 def test_a_free_drive_on_an_unknown_town_is_named(tmp_path: Path) -> None:
     text = ALONE.format(first=WAYPOINTS).replace('id="0" town="ProvingGround"', 'id="0" town="Elsewhere"')
     (tmp_path / "r.xml").write_text(text)
-    scenarios, omissions = read_leaderboard(tmp_path / "r.xml")
+    report = ImportReport("routes")
+    scenarios = read_leaderboard(tmp_path / "r.xml", report=report)
     assert [scenario.name for scenario in scenarios] == ["leaderboard/1/FreeDrive"]
-    assert omissions == ("town Elsewhere is not imported: its scenarios cannot be built (ssad import map)",)
+    assert report.omissions == {
+        "town Elsewhere is not imported: its scenarios cannot be built (ssad import map)": ["route 0"]
+    }
+    assert report.doubts == {}
+
+
+def test_a_route_that_does_not_fit_its_town_is_doubtful_and_refused_by_strict(tmp_path: Path) -> None:
+    text = ALONE.format(first=WAYPOINTS.replace('y="5.25"', 'y="900"'))
+    (tmp_path / "r.xml").write_text(text)
+    done = ssad("import", "leaderboard", tmp_path / "r.xml", tmp_path / "out.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "doubtful: left out: " in (tmp_path / "out.import.txt").read_text()
+    done = ssad("import", "leaderboard", tmp_path / "r.xml", tmp_path / "strict.yaml", "--strict")
+    assert done.returncode == 2
+    assert "route 0; correct the file, or import it without --strict" in done.stderr
+    assert not (tmp_path / "strict.yaml").exists()
 
 
 def _cut(old: str, new: str = "") -> Callable[[str], str]:

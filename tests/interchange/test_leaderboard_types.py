@@ -10,6 +10,7 @@ import pytest
 from helpers.leaderboard_routes import ROUTES, Route, flow, write_routes
 
 from ssad.core.errors import FormatError
+from ssad.core.import_report import ImportReport
 from ssad.core.types import F64, Controller, EpisodeTrace, Scenario, SignalPlan
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import read_leaderboard
@@ -42,8 +43,10 @@ ALONE = ("SequentialLaneChange", "T_Junction", *(kind for kind in ROUTES if kind
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Scenario, EpisodeTrace]]:
     """Type -> its scenario, and how the blind follower drives it when contacts are only counted."""
-    found, lost = read_leaderboard(write_routes(tmp_path_factory.mktemp("types") / "routes.xml"))
-    assert lost == ("speed of Accident",)
+    report = ImportReport("routes")
+    found = read_leaderboard(write_routes(tmp_path_factory.mktemp("types") / "routes.xml"), report=report)
+    assert list(report.omissions) == ["speed of Accident"]
+    assert not report.doubts
     episodes = [build_episode(s, load_town(s.town), seed=0) for s in found]
     world = World(episodes, {e.town: load_town(e.town) for e in episodes})
     traces = rollout(world, make_system("blind"), policies=make_system)
@@ -139,7 +142,7 @@ def test_a_car_is_braked_hard_and_goes_on(played: dict[str, tuple[Scenario, Epis
 def test_waits_begin_with_what_they_wait_for(speed: float, tmp_path: Path) -> None:
     """However late the ego comes: 10 s in which a car stands, and up to 1.5 s between walkers who wait for the ego."""
     kinds = ("BlockedIntersection", "HardBreakRoute", "PedestrianCrossing")
-    found, _ = read_leaderboard(write_routes(tmp_path / "routes.xml", kinds))
+    found = read_leaderboard(write_routes(tmp_path / "routes.xml", kinds))
     free = [replace(s, target_speed=speed, limits=replace(s.limits, contact="count", max_steps=600)) for s in found]
     episodes = [build_episode(s, load_town(s.town), seed=0) for s in free]
     world = World(episodes, {e.town: load_town(e.town) for e in episodes})
@@ -247,7 +250,7 @@ def test_oncoming_cars_come_after_the_ego(kind: str, played: dict[str, tuple[Sce
 def test_polite_drivers_get_by(tmp_path: Path) -> None:
     """The stopped car goes on after the ego has come and waited; the emergency car presses from behind."""
     kinds = ("BlockedIntersection", "YieldToEmergencyVehicle", "HighwayCutIn", "VehicleTurningRoutePedestrian")
-    found, _ = read_leaderboard(write_routes(tmp_path / "routes.xml", kinds))
+    found = read_leaderboard(write_routes(tmp_path / "routes.xml", kinds))
     episodes = [build_episode(s, load_town(s.town), seed=0) for s in found]
     world = World(episodes, {e.town: load_town(e.town) for e in episodes})
     blocked, pressed, cut, walker = rollout(world, make_system("autopilot"), policies=make_system)

@@ -16,7 +16,17 @@ from helpers.command import ssad
 from helpers.generated import generated
 
 from ssad.core.errors import FormatError
-from ssad.core.types import Actor, Episode, EpisodeLimits, EpisodeTrace, Phase, PhaseTrigger, Pose, Scenario
+from ssad.core.types import (
+    Actor,
+    Episode,
+    EpisodeLimits,
+    EpisodeTrace,
+    LateralPhase,
+    Phase,
+    PhaseTrigger,
+    Pose,
+    Scenario,
+)
 from ssad.drivers import make_system
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario
@@ -270,11 +280,12 @@ def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
     (actor,) = found.scenario.actors
     assert found.scenario.name == "Cut-in"
     assert (actor.pose.x, actor.pose.y) == pytest.approx((237.0, -1.75), abs=0.01)
-    assert actor.phases[0] == Phase(9.0, replace(actor.phases[0].when, kind="ego_distance", value=15.0))
+    assert actor.phases == (Phase(9.0, PhaseTrigger("ego_distance", 15.0, edge="rising"), name="go", shape="step"),)
+    after_10_m = PhaseTrigger("travelled", 10.0)
+    assert actor.lateral == (LateralPhase(-1, when=after_10_m, name="cut in", shape="linear", distance=20.0),)
+    assert (actor.model, actor.body.length, actor.body.width, actor.body.height) == ("suv", 4.5, 2.0, 1.8)
     assert found.scenario.limits.max_time == 20.0
-    lost = "\n".join(found.omissions)
-    assert "EnvironmentAction at the start" in lost
-    assert "the body of 'adversary' (4.5 x 2 m) becomes 'suv'" in lost
+    assert "EnvironmentAction at the start" in "\n".join(found.omissions)
     passed = replace(found.scenario, limits=replace(found.scenario.limits, contact="count"))
     (trace,) = drive(built([passed]), "blind")
     moving = np.flatnonzero(trace.speed[:, 1] > 0.0)
@@ -301,26 +312,25 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
     path.write_text(text)
     found = read_openscenario(path)
     (actor,) = found.scenario.actors
-    near = PhaseTrigger("ego_distance", 15.0)
+    near = PhaseTrigger("ego_distance", 15.0, edge="rising", delay=2.0)
     assert actor.phases == (
-        Phase(0.0, near),
-        Phase(9.0, PhaseTrigger("after", 2.0)),
-        Phase(0.0, PhaseTrigger("after", 3.5)),
+        Phase(9.0, near, name="go", shape="step"),
+        Phase(0.0, PhaseTrigger("after", 3.5), name="stop", shape="step"),
     )
     assert not any("delay" in line for line in found.omissions)
     (trace,) = drive(built([found.scenario]), "blind")
     gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
     moving, speed = int(np.flatnonzero(trace.speed[:, 1] > 0.0)[0]), trace.speed[:, 1]
     assert moving - 1 - int(np.flatnonzero(gap < 15.0)[0]) == 20
-    assert int(np.flatnonzero(np.diff(speed) > 0.1)[-1]) + 1 == moving - 1 + 35  # from then on it brakes
+    assert int(np.flatnonzero(np.diff(speed) < -0.1)[0]) == moving - 1 + 35  # from then on it brakes
 
-    path.write_text(text.replace('storyboardElementRef="go"', 'storyboardElementRef="a"'))
-    found = read_openscenario(path)
-    assert any("the delay of the trigger of 'stop' after another event" in line for line in found.omissions)
+    path.write_text(text.replace('Type="event" storyboardElementRef="go"', 'Type="act" storyboardElementRef="a"'))
+    (actor,) = read_openscenario(path).scenario.actors
+    assert actor.phases[1] == Phase(0.0, PhaseTrigger("time", 3.5), name="stop", shape="step", anytime=True)
     path.write_text(text.replace('state="startTransition"', 'state="completeState"'))
-    found = read_openscenario(path)
-    assert found.scenario.actors == (actor,)
-    assert any("is counted from where the event before begins" in line for line in found.omissions)
+    (actor,) = read_openscenario(path).scenario.actors
+    ended = PhaseTrigger("phase_end", agent="adversary", phase="go", delay=3.5)
+    assert actor.phases[1] == Phase(0.0, ended, name="stop", shape="step", anytime=True)
     timed = re.sub(
         "(?s)<ByEntityCondition>.*?</ByEntityCondition>",
         '<ByValueCondition><SimulationTimeCondition value="1.5" rule="greaterThan"/></ByValueCondition>',
@@ -328,7 +338,7 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
         count=1,
     )
     path.write_text(timed)
-    assert read_openscenario(path).scenario.actors[0].phases[0] == Phase(9.0, PhaseTrigger("time", 3.5))
+    assert read_openscenario(path).scenario.actors[0].phases[0].when == PhaseTrigger("time", 3.5)
     path.write_text(text.replace('delay="2"', 'delay="soon"'))
     with pytest.raises(FormatError, match="delay is 'soon', not a number"):
         read_openscenario(path)
@@ -378,9 +388,17 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "far beside": (_cut('dLane="1"', 'dLane="1e9"'), "no road has so many lanes"),
     "no lane there": (_cut('dLane="1"', 'dLane="12"'), "there is no lane 12 beside"),
     "a change beyond all lanes": (_cut('value="-1"', 'value="-1e300"'), "no road has so many lanes"),
-    "beyond everything": (_cut('x="217"', 'x="1e300"'), "does not stand on a road"),
+    "beyond everything": (
+        _cut('x="217"', 'x="1e300"'),
+        "'hero' starts at (1e+300, -5.25), outside the map",
+    ),
     "no parameter": (_cut('name="fast"', 'name="slow"'), "parameter $fast is not declared"),
-    "expression": (_cut("$fast", "${2 * $fast}"), "expressions are not read"),
+    "unknown name": (_cut("$fast", "${2 * $slow}"), "AbsoluteTargetSpeed: value: expression '2 * $slow': there is no"),
+    "division by zero": (_cut("$fast", "${$fast / 0}"), "expression '$fast / 0': division by zero"),
+    "circular": (
+        _cut('value="9.0"', 'value="$fast"'),
+        ":3: ParameterDeclaration: the parameter depends on itself: fast",
+    ),
     "in a ring": (_cut('entityRef="hero" dLane', 'entityRef="adversary" dLane'), "depends on itself"),
     "off the road": (_cut('y="5.25"', 'y="70"'), "does not stand on a road"),
     "empty condition": (lambda text: re.sub("<RelativeDistanceCondition.*?/>", "", text, flags=re.DOTALL), "is empty"),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.command import ssad
 
+from ssad.core.import_report import ImportReport
 from ssad.core.types import Controller, Episode, EpisodeAgent, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.scenic_programs import ScenicProgram, load_program, map_of, sample
@@ -85,12 +86,13 @@ def braking(tmp_path_factory: pytest.TempPathFactory) -> ScenicProgram:
 
 def test_a_program_of_the_driving_library_runs_unchanged(braking: ScenicProgram) -> None:
     """The leader drives for 4 s and brakes; the ego, whose behaviour sees it, stops behind."""
-    drawn = sample(braking, 3)
+    report = ImportReport("program")
+    drawn = sample(braking, 3, report=report)
     lead, walker = drawn.scenario.actors
     assert (drawn.scenario.town, drawn.scenario.name, walker.trajectory) == (TOWN, "braking/03", ())
     assert (lead.name, lead.model, walker.model) == ("Car-1", "suv", "walker")
     assert "9 seconds" in drawn.end_reason or "time" in drawn.end_reason
-    assert any("4.5 x 2 m object becomes 'suv'" in line for line in drawn.omissions)
+    assert any("4.5 x 2 m object becomes 'suv'" in reason for reason in report.omissions)
     rows = np.array(lead.trajectory)
     driven = np.r_[0.0, np.cumsum(np.hypot(*np.diff(rows[:, 1:3], axis=0).T))]
     at = np.interp((4.0, 6.5, 9.0), rows[:, 0], driven)
@@ -155,7 +157,7 @@ def test_command(braking: ScenicProgram, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert [s.name for s in read_scenarios(tmp_path / "a.yaml")] == ["braking/00", "braking/01"]
     assert "2 scenarios in Twinford" in done.stdout
-    assert "not carried over: the body of a 4.5 x 2 m object becomes 'suv' (2 scenarios)" in done.stdout
+    assert "not carried over: the body of a 4.5 x 2 m object becomes 'suv' (2 times)" in done.stdout
 
 
 HEAD = "model scenic.domains.driving.model\n"

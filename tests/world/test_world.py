@@ -208,12 +208,12 @@ def test_a_phase_waits_after_the_one_before_it(device: str) -> None:
     middle = firsts[1] + 8
     assert begun(world, middle)[1] == hashes[:middle]
     kept = world.snapshot()
-    assert (world.array("since")[:, 1] > 0).tolist() == [False, True, True, False]
+    assert (world.array("script.begun")[:, 0] > 0).tolist() == [False, True, True, True]
     other = World(scenes, GRAPHS, device=device)
     other.restore(kept)
     assert begun(other, 40)[1] == hashes[middle : middle + 40]
     other.restore(kept)
-    other.put("since", world.array("since") - 1)
+    other.put("script.begun", world.array("script.begun") + 1)
     assert [a != b for a, b in zip(other.hashes(), world.hashes(), strict=True)] == [True] * 4
 
 

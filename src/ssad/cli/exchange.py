@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ssad.cli import paths
-from ssad.cli.importing import Strict, check_yaml, store_town
+from ssad.cli.importing import Strict, check_yaml, show_report, store_town
 from ssad.cli.options import Dir
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, FormatError
+
+if TYPE_CHECKING:
+    from ssad.world.roads.lanelet2 import Lanelet2Options
 
 
 def export_texture(
@@ -61,7 +62,10 @@ def export_light(
 
 def import_map(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="OpenDRIVE file (.xodr), Lanelet2 map (.osm), or a town as SSAD stores it (.npz)."
+        ),
     ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
     strict: Strict = False,
@@ -72,8 +76,26 @@ def import_map(
             help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON",
+            help="Lanelet2: latitude and longitude of the town's origin.  [default: middle of the map]",
+        ),
+    ] = None,
+    projection: Annotated[
+        str | None,
+        typer.Option(
+            metavar="utm|local",
+            help="Lanelet2: UTM, or transverse Mercator around the origin.  [default: local_x and local_y, else UTM]",
+        ),
+    ] = None,
+    left_hand: Annotated[
+        bool | None,
+        typer.Option("--left-hand/--right-hand", help="Lanelet2: side that traffic keeps to.  [default: by the map]"),
+    ] = None,
 ) -> None:
-    """Import an OpenDRIVE map (1.4 to 1.8) as a town; say what came in, what was left out, and what is doubtful.
+    """Import an OpenDRIVE map (1.4 to 1.8) or a Lanelet2 map as a town; say what is left out and what is doubtful.
 
     A page with this report and a picture from above is written too.
     """
@@ -96,9 +118,30 @@ def import_map(
         strict=strict,
         turn_on_red=turn_on_red,
         progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
+        lanelet2=_lanelet2_options(origin, projection, left_hand),
     )
     print(report.text(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}"))
     print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
+
+
+def _lanelet2_options(origin: str | None, projection: str | None, left_hand: bool | None) -> Lanelet2Options | None:
+    """Return the options of a Lanelet2 map; None if no option is given."""
+    from ssad.world.roads.lanelet2 import Lanelet2Options
+
+    if origin is None and projection is None and left_hand is None:
+        return None
+    if projection not in (None, "utm", "local"):
+        raise ConfigError(f"--projection {projection}: choose utm or local")
+    place = None
+    if origin is not None:
+        try:
+            latitude, longitude = (float(number) for number in origin.split(","))
+        except ValueError:
+            raise ConfigError(f"--origin {origin}: give latitude and longitude, such as 49.01,8.43") from None
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+            raise ConfigError(f"--origin {origin}: latitudes end at 90 degrees, longitudes at 180")
+        place = (latitude, longitude)
+    return Lanelet2Options(place, projection, left_hand)  # type: ignore[arg-type]
 
 
 def import_routes(
@@ -106,8 +149,10 @@ def import_routes(
         Path, typer.Argument(metavar="FOLDER", help="Routes of SafeBench, FREA (or a checkout) or leaderboard 1.0.")
     ],
     name: Annotated[str | None, typer.Option(help="Name of the set.  [default: name of the folder]")] = None,
+    strict: Strict = False,
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
+    from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
@@ -119,18 +164,16 @@ def import_routes(
         raise ConfigError(f"'{set_name}' cannot name a set; choose a name of letters, digits, _ and - with --name")
     if set_name in BUILT_IN_SETS:
         raise ConfigError(f"'{set_name}' is a built-in set; choose another name with --name")
-    left_out: list[str] = []
-    scenarios = read(folder, omissions=left_out)
+    report = ImportReport(str(folder))
+    scenarios = read(folder, report=report)
+    if strict:
+        report.refuse_doubts(FormatError)
     path = home_folder() / "scenarios" / f"{set_name}.yaml"
     save_scenarios(path, scenarios)
     towns = sorted({scenario.town for scenario in scenarios})
-    print(f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
     if missing := [town for town in towns if not is_town(town)]:
-        print(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE.xodr")
-    # Entries of one file with the same problem are reported in one line.
-    reasons = Counter(re.sub(r": entry \d+", "", reason) for reason in left_out)
-    for reason, count in reasons.items():
-        print(f"left out or not read: {reason}{f' ({count} entries)' if count > 1 else ''}")
+        report.note(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE")
+    show_report(report, f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}", path)
 
 
 def import_drive(
@@ -140,27 +183,29 @@ def import_drive(
     version: Annotated[str | None, typer.Option(help="Version.  [default: the only one]")] = None,
     on: Annotated[
         str | None,
-        typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file, of the place.  [default: logged paths]"),
+        typer.Option("--map", metavar="MAP", help="Town, or map file, of the place.  [default: logged paths]"),
     ] = None,
+    strict: Strict = False,
 ) -> None:
     """Turn a logged drive in the nuScenes schema into a scenario: the ego is driven anew, all others as logged.
 
     Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
     """
     paths.check_exists(root)
+    from ssad.core.import_report import ImportReport
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
+    report = ImportReport(str(root))
     with NuScenes(root, version) as data:
-        imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
+        imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on, report=report)
+    if strict:
+        report.refuse_doubts(FormatError)
     town = imported_drive.scenario.town
     if not imported_drive.is_known_town:
         store_town(imported_drive.graph, town, beside=out)
     save_scenarios(out, imported_drive.scenario)
-    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.omissions.items()))
-    print(
-        f"scenario {imported_drive.scenario.name}: {len(imported_drive.scenario.actors)} actors in {town}"
-        f"{f'; left out: {omissions}' if omissions else ''}; written to {out}"
-    )
+    scenario = imported_drive.scenario
+    show_report(report, f"scenario {scenario.name}: {len(scenario.actors)} actors in {town}; written to {out}", out)

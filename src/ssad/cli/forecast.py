@@ -68,6 +68,7 @@ def forecast(plan: Plan, folder: Path, resources: Resources, *, sample: int = 0)
         f"cells: {len(plan.cells)}, of which {len(finished_keys)} are there already and {len(remaining)} would run"
     )
     lines += [f"  {system or 'all'}: {count}" for system, count in cells_per_system.items()]
+    lines += plan.kind.plan_lines(plan)
     if not remaining:
         return lines
     rates, source = sampled_rates(plan, resources, sample) if sample else earlier_rates(plan, folder)

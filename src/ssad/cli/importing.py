@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from ssad.cli import paths
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, FormatError
 
 if TYPE_CHECKING:
     from ssad.core.import_report import ImportReport
@@ -87,23 +87,46 @@ def import_openscenario(
     on: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: the file's own]")
     ] = None,
+    values: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Value of a parameter of the file.")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Scenarios to draw from a distribution.  [default: all]")
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse a file with anything that is doubtful or not carried over.")
+    ] = False,
 ) -> None:
-    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into scenarios, and say what it does not carry over.
+
+    A file of a ParameterValueDistribution becomes a set: one scenario for each set of values. The map beside the file
+    is imported with it.
+    """
     paths.check_exists(file)
-    from ssad.interchange.openscenario_reader import read_openscenario
+    from ssad.core.errors import FormatError
+    from ssad.interchange.openscenario_distributions import assigned_values
+    from ssad.interchange.openscenario_reader import read_openscenario_set
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    imported = read_openscenario(file, map_name=on)
-    save_scenarios(out, imported.scenario)
-    scenario = imported.scenario
-    print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
-    print_counted("not carried over", imported.omissions)
+    imported = read_openscenario_set(file, map_name=on, assigned=assigned_values(values or []), count=count)
+    if strict:
+        imported.report.refuse_omissions(FormatError)
+        imported.report.refuse_doubts(FormatError)
+    scenarios = imported.scenarios
+    save_scenarios(out, scenarios if len(scenarios) > 1 else scenarios[0])
+    towns = ", ".join(sorted({scenario.town for scenario in scenarios}))
+    if len(scenarios) > 1:
+        first_line = f"{len(scenarios)} scenarios in {towns}; written to {out}"
+    else:
+        first_line = f"scenario {scenarios[0].name}: {len(scenarios[0].actors)} actors in {towns}; written to {out}"
+    show_report(imported.report, first_line, out)
 
 
 def import_leaderboard(
     file: Annotated[Path, typer.Argument(metavar="ROUTES.xml", help="Routes of leaderboard 2.0 or Bench2Drive.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    strict: Strict = False,
 ) -> None:
     """Turn routes of leaderboard 2.0 or Bench2Drive into scenarios; `ssad import routes` reads leaderboard 1.0.
 
@@ -112,18 +135,20 @@ def import_leaderboard(
     paths.check_exists(file)
     from rich.console import Console
 
+    from ssad.core.import_report import ImportReport
     from ssad.engine.progress import LiveProgress
     from ssad.interchange.leaderboard import read_leaderboard
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
+    report = ImportReport(str(file))
     with LiveProgress("import", 1, 0, console=Console(stderr=True), unit="routes") as progress:
-        imported, omissions = read_leaderboard(file, report=progress.show)
+        imported = read_leaderboard(file, report=report, progress=progress.show)
+    if strict:
+        report.refuse_doubts(FormatError)
     save_scenarios(out, imported)
-    print(
-        f"{len(imported)} scenarios on {', '.join(sorted({scenario.town for scenario in imported}))}; written to {out}"
-    )
-    print_counted("not carried over", omissions)
+    towns = ", ".join(sorted({scenario.town for scenario in imported}))
+    show_report(report, f"{len(imported)} scenarios on {towns}; written to {out}", out)
 
 
 def import_commonroad(
@@ -132,24 +157,29 @@ def import_commonroad(
     on: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: its lanelets]")
     ] = None,
+    strict: Strict = False,
 ) -> None:
-    """Turn a CommonRoad file into a scenario, and say what it does not carry over.
+    """Turn a CommonRoad file into a scenario; say what is left out and what is doubtful.
 
     XML 2018b and protobuf need the extra `commonroad`. Lanelets that are no town's yet are stored as a town beside
     OUT.yaml too.
     """
     paths.check_exists(file)
+    from ssad.core.import_report import ImportReport
     from ssad.interchange.commonroad_reader import read_commonroad
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    imported = read_commonroad(file, town=out.stem, map_name=on)
+    report = ImportReport(str(file))
+    imported = read_commonroad(file, town=out.stem, map_name=on, report=report)
+    if strict:
+        report.refuse_doubts(FormatError)
     town = imported.scenario.town
     if not imported.is_known_town:
         store_town(imported.graph, town, beside=out)
     save_scenarios(out, imported.scenario)
-    print(f"scenario {imported.scenario.name}: {len(imported.scenario.actors)} actors in {town}; written to {out}")
-    print_counted("not carried over", imported.omissions)
+    scenario = imported.scenario
+    show_report(report, f"scenario {scenario.name}: {len(scenario.actors)} actors in {town}; written to {out}", out)
 
 
 def import_scenic(
@@ -161,36 +191,39 @@ def import_scenic(
     count: Annotated[int, typer.Option(min=1, help="Samples.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first sample; each has one more.")] = 0,
     steps: Annotated[int, typer.Option(min=1, max=10_000, help="Most steps of a simulation, 0.1 s each.")] = 300,
+    strict: Strict = False,
 ) -> None:
     """Simulate samples of a Scenic program here, and turn what happens into scenarios. Needs the extra `scenic`.
 
-    The ego is driven anew; all others repeat what the program had them do.
+    The ego is driven anew; all others repeat what the program had them do. Samples that fail are doubtful.
     """
     from ssad.core.errors import MissingExtraError, SSADError
+    from ssad.core.import_report import ImportReport
     from ssad.interchange.scenic_programs import load_program, sample
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
     program = load_program(file, on)
+    report = ImportReport(str(file))
     sampled = []
-    failures: list[str] = []
-    omissions: list[str] = []
     for sample_seed in range(seed, seed + count):
         try:
-            program_sample = sample(program, sample_seed, steps=steps)
+            program_sample = sample(program, sample_seed, steps=steps, report=report)
         except MissingExtraError:
             raise
         except SSADError as error:
-            failures.append(str(error))
+            if count == 1:
+                raise
+            report.doubt(f"not sampled: {error}")
             continue
         sampled.append(program_sample.scenario)
-        omissions += program_sample.omissions
     if not sampled:
-        raise ConfigError(failures[0])
+        raise ConfigError(next(iter(report.doubts)).removeprefix("not sampled: "))
+    if strict:
+        report.refuse_doubts(FormatError)
+    report.contents.append(f"{len(sampled)} of {count} samples, seeds {seed} to {seed + count - 1}")
     save_scenarios(out, sampled)
-    print(f"{len(sampled)} scenarios in {program.town}; written to {out}")
-    print_counted("not sampled", failures)
-    print_counted("not carried over", omissions)
+    show_report(report, f"{len(sampled)} scenarios in {program.town}; written to {out}", out)
 
 
 def check_yaml(out: Path) -> None:

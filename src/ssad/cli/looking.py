@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ssad.cli import paths
+from ssad.cli.importing import show_report
 from ssad.cli.options import Device
 from ssad.core.errors import ConfigError
 
@@ -113,7 +114,7 @@ def show(
     scenes: Annotated[str, typer.Option(help="Only these scenes, comma-separated.  [default: the first ten]")] = "",
     samples: Annotated[int, typer.Option(min=1, help="Moments of each scene, spread over it.")] = 3,
 ) -> None:
-    """Write a page to look at a data set: pictures with their boxes, and the LiDAR from above.
+    """Write a page to look at a data set: pictures with their boxes, and the LiDAR from above; name what is not read.
 
     Of pictures that are no nuScenes folder, the page shows each upright. Exit code 1: some cannot be read.
     """
@@ -123,6 +124,7 @@ def show(
 
     from ssad.datasets.browse import check_scenes, write_page
     from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.datasets.picture_folders import folder_report
     from ssad.datasets.picture_page import pictures_of, write_picture_page
     from ssad.engine.progress import LiveProgress
 
@@ -132,7 +134,13 @@ def show(
             raise ConfigError(f"--scenes is for a nuScenes folder; {root} has no VERSION/sample_data.json")
         with LiveProgress("show", 1, 0, console=Console(stderr=True), unit="pictures") as progress:
             picture_page = write_picture_page(root.resolve().name, files, out, progress=progress.show)
-        print(f"page: {picture_page.path} ({picture_page.shown} of {picture_page.total} pictures and point clouds)")
+        first_line = (
+            f"page: {picture_page.path} ({picture_page.shown} of {picture_page.total} pictures and point clouds)"
+        )
+        if root.is_dir():
+            show_report(folder_report(root), first_line, picture_page.path)
+        else:
+            print(first_line)
         for problem in picture_page.problems:
             print(f"not read: {problem}")
         if picture_page.problems:
@@ -143,4 +151,5 @@ def show(
         check_scenes(data, names)
         with LiveProgress("show", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
             page = write_page(data, out, scenes=names, moments=samples, progress=progress.show)
-    print(f"page: {page}")
+        report = data.report()
+    show_report(report, f"page: {page}", page)

@@ -25,7 +25,7 @@ EXPORTED_TEXTURE = ("texture.json",)
 EXPORTED_LIGHT = ("light.json",)
 """Names of what a command writes, by which it knows its own folder."""
 
-NAMED_FILE = re.compile(r"(?:[\w.-]+:)?([^\s:?@*]+\.(?:yaml|yml|safetensors|py|xodr|xosc|onnx))(?:[:?@].*)?")
+NAMED_FILE = re.compile(r"(?:[\w.-]+:)?([^\s:?@*]+\.(?:yaml|yml|safetensors|py|xodr|osm|xosc|onnx))(?:[:?@].*)?")
 
 
 def check_out(folder: Path | None, patterns: Sequence[str], *, option: str = "--out") -> None:

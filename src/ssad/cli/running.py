@@ -66,7 +66,7 @@ def run(
     from rich.console import Console
 
     from ssad.engine.kind import Resources
-    from ssad.experiments.runs import summary
+    from ssad.experiments.runs import matrices, summary
     from ssad.results import make_plan, run_plan
 
     if sample and not dry_run:
@@ -96,6 +96,8 @@ def run(
         raise typer.Exit(130) from None
     console = Console()
     console.print(summary(folder))
+    for matrix in matrices(folder):
+        console.print(matrix)
     failures = results.failures
     for row in failures[:5]:
         name = results.names[row["key"]]

@@ -13,8 +13,10 @@ import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ssad.core.errors import StoreError
+from ssad.core.errors import ConfigError, StoreError
 
+LINKS_VARIABLE = "SSAD_DATA_LINKS"
+"""Environment variable: folders that symbolic links of data sets may lead to, separated as in PATH."""
 RUN_FILE, RECORDING_FILE = "run.json", ".parts/recording.json"
 ROOT_FILES = (RUN_FILE, RECORDING_FILE)
 """Files that make a folder a root, by name below it."""
@@ -32,22 +34,67 @@ def path_inside(root: str | Path, relative: str | Path) -> Path:
             nor a folder.
     """
     path = Path(root).joinpath(*_parts(root, relative))
+    if not _destination(path).is_relative_to(Path(root).resolve()):
+        raise StoreError(f"{path}: leads out of {root}; remove that symbolic link")
+    return path
+
+
+def data_path(root: str | Path, relative: str | Path, *, source: str | Path | None = None) -> Path:
+    """Return the path of a file or folder of a data set, which need not exist.
+
+    Symbolic links may stay inside the data set, or lead to a folder that the user allows with `SSAD_DATA_LINKS`.
+
+    Args:
+        root: Folder of the data set.
+        relative: Name below it.
+        source: The data set of which this one is a changed copy: links may lead to its file of the same name.
+
+    Raises:
+        StoreError: The name is absolute or has a parent part, the path leads elsewhere, or it is neither a file nor a
+            folder.
+        ConfigError: `SSAD_DATA_LINKS` holds something else than absolute paths.
+    """
+    path = Path(root).joinpath(*_parts(root, relative))
+    destination = _destination(path)
+    if destination.is_relative_to(Path(root).resolve()) or is_linkable(destination):
+        return path
+    if source is not None and destination == data_path(source, relative).resolve():
+        return path
+    raise StoreError(f"{path}: leads out of {root} to {destination}; {link_remedy(destination)}")
+
+
+def is_linkable(destination: Path) -> bool:
+    """Return whether links of data sets may lead to a resolved path: it lies in a folder of `SSAD_DATA_LINKS`.
+
+    Raises:
+        ConfigError: `SSAD_DATA_LINKS` holds something else than absolute paths.
+    """
+    folders = [Path(text) for text in os.environ.get(LINKS_VARIABLE, "").split(os.pathsep) if text]
+    for folder in folders:
+        if not folder.is_absolute():
+            raise ConfigError(f"{LINKS_VARIABLE}: {folder} is no absolute path; give folders separated by {os.pathsep}")
+    return any(destination.is_relative_to(folder.resolve()) for folder in folders)
+
+
+def link_remedy(destination: Path) -> str:
+    """Return what to do about a link that leads out of a data set to a resolved path."""
+    folder = destination if destination.is_dir() else destination.parent
+    return f"copy that here, or allow such links with {LINKS_VARIABLE}={folder}"
+
+
+def _destination(path: Path) -> Path:
+    """Return where a path leads after all links. StoreError for a circle, and for what is no file and no folder."""
     try:
-        resolved_path, resolved_root = path.resolve(), Path(root).resolve()
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        mode = stat.S_IFREG
-    except NotADirectoryError:
-        mode = stat.S_IFREG
+        destination, mode = path.resolve(), path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return path.resolve()
     except OSError as error:
         raise StoreError(f"{path}: cannot be read: {error.strerror or error}") from None
     except RuntimeError:  # before Python 3.13 for links in a circle
         raise StoreError(f"{path}: is a symbolic link to itself; remove it") from None
-    if not resolved_path.is_relative_to(resolved_root):
-        raise StoreError(f"{path}: leads out of {root}; remove that symbolic link")
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise StoreError(f"{path}: is neither a file nor a folder; remove it")
-    return path
+    return destination
 
 
 def open_inside(root: str | Path, relative: str | Path, flags: int) -> int:

@@ -58,7 +58,7 @@ _OTHER_SUFFIXES: Final = (
 )
 _ORIENTATION: Final = 0x0112  # EXIF tag
 _BITS_PER_SAMPLE: Final = 0x0102  # TIFF tag
-_PLANAR: Final = 0x011C  # TIFF tag: 2 where each channel is stored by itself
+_PLANAR: Final = 0x011C  # TIFF tag
 _JPEG: Final = b"\xff\xd8\xff"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_BLOCKS: Final = len(_PNG) + 25  # offset behind the header block of a PNG
@@ -153,8 +153,8 @@ def decode_image_file(data: bytes, name: str = "<image>") -> ImageFile:
             pixels = turn_upright(stored, orientation)
             return ImageFile(pixels, None, file_format, orientation, model, lossless, frames, name)
         has_16_bits = _has_16_bits(image_file, data)
-        if has_16_bits and file_format == "TIFF" and image_file.tag_v2.get(_PLANAR, 1) == 2:
-            # OpenCV reads the planes as if their channels were interleaved.
+        if has_16_bits and _has_planes(image_file):
+            # OpenCV reads them as if their channels were interleaved.
             raise FormatError(f"{name}: 16 bits a channel in separate planes are not supported; save it as PNG")
         if not has_16_bits:
             image_file.load()
@@ -221,6 +221,11 @@ def _has_16_bits(image_file: Any, data: bytes) -> bool:
     if image_file.format == "PPM":
         return _pnm_maximum(data) > 255
     return image_file.format == "TIFF" and bool(image_file.tag_v2.get(_BITS_PER_SAMPLE, (8,))[0] == 16)
+
+
+def _has_planes(image_file: Any) -> bool:
+    """Return True for a TIFF that stores each channel by itself."""
+    return image_file.format == "TIFF" and bool(image_file.tag_v2.get(_PLANAR, 1) == 2)
 
 
 def _pnm_maximum(data: bytes) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -79,11 +79,15 @@ class ImportReport:
     def refuse_doubts(self, error: type[SSADError]) -> None:
         """Raise an error that names the first doubt, if there is one."""
         if self.doubts:
-            reason, places = next(iter(self.doubts.items()))
-            others = len(self.doubts) - 1
             raise error(
-                f"{self.source}: {_line(reason, places, EXAMPLES)}{f', and {others} other doubts' if others else ''};"
-                " correct the file, or import it without --strict"
+                f"{self.source}: {_first(self.doubts, 'doubts')}; correct the file, or import it without --strict"
+            )
+
+    def refuse_omissions(self, error: type[SSADError]) -> None:
+        """Raise an error that names the first omission, if there is one."""
+        if self.omissions:
+            raise error(
+                f"{self.source}: not carried over: {_first(self.omissions, 'omissions')}; import it without --strict"
             )
 
 
@@ -98,6 +102,13 @@ def wrapped(lines: Iterable[str]) -> str:
         textwrap.fill(line, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
         for line in lines
     )
+
+
+def _first(lines: Mapping[str, Sequence[str]], word: str) -> str:
+    """Return the first reason with its places, and the number of the others, which a word names."""
+    reason, places = next(iter(lines.items()))
+    others = len(lines) - 1
+    return f"{_line(reason, places, EXAMPLES)}{f', and {others} other {word}' if others else ''}"
 
 
 def _line(reason: str, places: Sequence[str], examples: int | None) -> str:

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -380,19 +380,36 @@ def to_plain_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
+def parse_xml(
+    text: str | bytes,
+    name: str = "<text>",
+    *,
+    element_factory: Callable[[str, dict[str, str], int], Element] | None = None,
+) -> Element:
     """Return the root of an XML text; DTDs, entities and external data are refused.
+
+    Args:
+        text: The text.
+        name: Its name in messages.
+        element_factory: Makes an element of its tag, its attributes and its line in the text; None: an `Element`.
 
     Raises:
         FormatError: It is refused, or not valid XML, with the line.
     """
-    from xml.etree.ElementTree import ParseError
+    from xml.etree.ElementTree import ParseError, TreeBuilder
 
     import defusedxml
     import defusedxml.ElementTree as safe
 
+    def element_at_line(tag: str, attributes: dict[str, str]) -> Element:
+        assert element_factory is not None
+        return element_factory(tag, attributes, parser.parser.CurrentLineNumber)
+
+    builder = TreeBuilder() if element_factory is None else TreeBuilder(element_factory=element_at_line)
+    parser = safe.DefusedXMLParser(target=builder, forbid_dtd=True)
     try:
-        root: Element = safe.fromstring(text, forbid_dtd=True)
+        parser.feed(text)
+        root: Element = parser.close()
     except defusedxml.DefusedXmlException as error:
         reason = type(error).__name__
         raise FormatError(f"{name}: refused: it declares a DTD, entities or external data ({reason})") from None
@@ -404,13 +421,18 @@ def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
     return root
 
 
-def read_xml(path: str | Path, *, limit: int = 256 * MIB) -> Element:
-    """Read the root element of an XML file, safely.
+def read_xml(
+    path: str | Path,
+    *,
+    limit: int = 256 * MIB,
+    element_factory: Callable[[str, dict[str, str], int], Element] | None = None,
+) -> Element:
+    """Read the root element of an XML file, safely; `element_factory` as in `parse_xml`.
 
     Raises:
         FormatError: The file cannot be read, is larger than `limit` bytes, or is not valid XML.
     """
-    return parse_xml(read_bytes(path, limit=limit), str(path))
+    return parse_xml(read_bytes(path, limit=limit), str(path), element_factory=element_factory)
 
 
 # ---------------------------------------------------------------- npz

@@ -176,35 +176,204 @@ class Pose:
     yaw: float = 0.0
 
 
+TriggerKind = Literal[
+    "always",
+    "time",
+    "after",
+    "ego_distance",
+    "ego_speed",
+    "travelled",
+    "speed",
+    "relative_speed",
+    "acceleration",
+    "standstill",
+    "distance",
+    "time_to_collision",
+    "time_headway",
+    "position",
+    "phase_start",
+    "phase_end",
+]
+Shape = Literal["linear", "sinusoidal", "cubic", "step"]
+
+
 @dataclass(frozen=True)
 class PhaseTrigger:
     """Condition that starts a phase.
 
-    kind `ego_distance`: centre distance between the ego and actor number `actor` falls below `value` metres;
-    `ego_speed`: the ego drives faster than `value` m/s; `travelled`: the actor itself has moved more than `value`
-    metres; `time`: `value` seconds since the episode began; `after`: `value` seconds since the phase before it began
-    (the first phase: since the episode began); `always`: at once.
+    The trigger holds if the condition of its `kind` holds, all triggers in `all` hold, and at least one in `any` holds
+    (if there are any). An agent is named by the name of its actor, or `ego`.
+
+    Attributes:
+        kind: `always`: at once.
+            `time`: `value` seconds have passed since the episode began.
+            `after`: `value` seconds have passed since the phase before it began (the first phase: since the episode
+            began).
+            `ego_distance`: the centres of the ego and of actor number `actor` are less than `value` metres apart.
+            `ego_speed`: the ego drives faster than `value` m/s.
+            `travelled`: `agent` has moved more than `value` metres.
+            `speed`, `acceleration`: that of `agent` is above `value` (m/s, m/s^2 along its heading).
+            `relative_speed`: the speed of `agent` minus that of `reference` is above `value` m/s.
+            `standstill`: `agent` has stood for `value` seconds.
+            `distance`: `agent` is less than `value` metres from `reference`, or from `position`.
+            `time_to_collision`: that distance over the speed at which it falls is below `value` seconds.
+            `time_headway`: that distance over the speed of `agent` is below `value` seconds.
+            `position`: `agent` is less than `value` metres from `position`.
+            `phase_start`, `phase_end`: the phase `phase` of `agent` has begun; has ended, or another has overridden it.
+        value: Threshold; units as above.
+        actor: Number of the actor of `ego_distance`.
+        agent: Agent whose quantity is measured; "": the actor itself.
+        reference: Other agent; "": the ego, or the actor itself where `agent` is the ego.
+        position: Point x, y in the world frame that takes the place of `reference`, m.
+        rule: Whether the quantity has to be above or below `value`; "": as described with the kind.
+        edge: Change of the condition that counts: `rising`, it begins to hold; `falling`, it ceases to; `both`; `none`,
+            that it holds. With an edge it holds for one step, never in the first.
+        delay: Time after which the condition counts, s: its value is that of `delay` seconds ago.
+        free_space: Measure distances between the bodies instead of their centres.
+        measure: `straight`: the shortest distance. `road`: along the path of `agent` (without a path: of `reference`,
+            or along the heading of `agent`). `lateral`: across it.
+        phase: Name of a phase, for `phase_start` and `phase_end`.
+        all: Triggers that must all hold.
+        any: Triggers of which one must hold.
     """
 
-    kind: Literal["always", "ego_distance", "ego_speed", "travelled", "time", "after"] = "always"
+    kind: TriggerKind = "always"
     value: float = 0.0
     actor: int = 0
+    agent: str = ""
+    reference: str = ""
+    position: tuple[float, float] | None = None
+    rule: Literal["", "above", "below"] = ""
+    edge: Literal["none", "rising", "falling", "both"] = "none"
+    delay: float = 0.0
+    free_space: bool = False
+    measure: Literal["straight", "road", "lateral"] = "straight"
+    phase: str = ""
+    all: tuple[PhaseTrigger, ...] = ()
+    any: tuple[PhaseTrigger, ...] = ()
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Meeting of two agents: the actor reaches `point` at the time at which `reference` reaches `reference_point`.
+
+    Attributes:
+        point: Point x, y on the actor's path, or on the straight line ahead of it, m.
+        reference_point: Point x, y on the way of the other agent, m.
+        reference: Name of the other agent.
+    """
+
+    point: tuple[float, float]
+    reference_point: tuple[float, float]
+    reference: str = "ego"
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One piece of a scripted behaviour: once `when` holds (latched, in order), drive at `speed` m/s."""
+    """One piece of a scripted behaviour: once `when` holds (latched, in order), drive at `speed` m/s.
 
-    speed: float
+    Without `acceleration`, `duration` and `distance`, a vehicle reaches the speed with the full acceleration or the
+    full brakes of its model, and a walker at once. A phase that begins overrides the one that runs.
+
+    Attributes:
+        speed: Target speed, m/s. With `reference`: difference to its speed (or, with `factor`, multiple of it). With
+            `arrival`: speed at the point; None: any.
+        when: Condition that starts the phase.
+        name: Name by which triggers refer to the phase.
+        acceleration: Magnitude of the change of speed, m/s^2; a negative sign, for braking, has no further meaning.
+            With a shape other than `linear`: its greatest magnitude.
+        jerk: Greatest change of the acceleration, m/s^3; None: no limit. For the shape `linear`.
+        shape: Course of the speed over time: `linear`; `sinusoidal`, half a period of a cosine; `cubic`, 3 s^2 - 2 s^3;
+            `step`, at once.
+        duration: Time until the speed is reached, s.
+        distance: Distance over which the speed is reached, m.
+        reference: Agent to whose speed `speed` refers; "": none.
+        factor: Take `speed` as a multiple of the speed of `reference`, not as the difference to it.
+        continuous: Go on following the speed of `reference`, not only that at the start of the phase.
+        arrival: Meeting that determines the speed in place of a target speed.
+        anytime: Begin as soon as `when` holds, even if phases earlier in the list have not begun.
+    """
+
+    speed: float | None = None
     when: PhaseTrigger = field(default_factory=PhaseTrigger)
+    name: str = ""
+    acceleration: float | None = None
+    jerk: float | None = None
+    shape: Shape = "linear"
+    duration: float | None = None
+    distance: float | None = None
+    reference: str = ""
+    factor: bool = False
+    continuous: bool = False
+    arrival: Arrival | None = None
+    anytime: bool = False
+
+
+@dataclass(frozen=True)
+class LateralPhase:
+    """One lateral motion: once `when` holds, change to another lane or another place in the lane.
+
+    Lateral phases run beside the phases that determine the speed. One that begins overrides the one that runs. At most
+    one of `duration`, `distance` and `rate` is given; without, the motion takes 3 s.
+
+    Attributes:
+        lanes: Lanes to the left of the lane to which the phase before it led (negative: right).
+        offset: Distance left of the centre of that lane; without lane changes, left of the path, m.
+        when: Condition that starts the phase.
+        name: Name by which triggers refer to the phase.
+        shape: Course of the lateral position: `sinusoidal`, `cubic`, `linear`, or `step`, at once.
+        duration: Time that it takes, s.
+        distance: Distance along the path that it takes, m.
+        rate: Greatest lateral speed, m/s.
+        anytime: Begin as soon as `when` holds, even if phases earlier in the list have not begun.
+    """
+
+    lanes: int = 0
+    offset: float = 0.0
+    when: PhaseTrigger = field(default_factory=PhaseTrigger)
+    name: str = ""
+    shape: Shape = "sinusoidal"
+    duration: float | None = None
+    distance: float | None = None
+    rate: float | None = None
+    anytime: bool = False
+
+
+@dataclass(frozen=True)
+class Impact:
+    """Place where an actor and the front of the ego would touch if nobody acted; it determines the actor's start.
+
+    The ego drives along its route at one speed, the actor straight ahead (along the route, if that is its heading) at
+    its start speed. An actor without a speed stands where the impact is.
+
+    Attributes:
+        distance: Way of the ego from its start to the impact, m.
+        location: Centre of the actor across the front of the ego, as a share of the ego's width: 0 is the ego's left
+            edge, 0.5 its centre line, 1 its right edge.
+        overlap: Share of the ego's width that the actor covers, in place of `location`; at 1, and where the actor is
+            too narrow, the centre lines coincide.
+        side: Side of the ego's centre line on which the centre of the actor is, with `overlap`.
+        heading: Heading of the actor relative to the route, rad: 0 the same direction, pi oncoming, pi / 2 from the
+            right to the left of the ego.
+        ego_speed: Speed of the ego, m/s; None: that at its start, or its target speed if it starts from a standstill.
+    """
+
+    distance: float
+    location: float = 0.5
+    overlap: float | None = None
+    side: Literal["left", "right"] = "left"
+    heading: float = 0.0
+    ego_speed: float | None = None
 
 
 @dataclass(frozen=True)
 class Actor:
     """A scripted participant of a scenario: pose in the world frame, phases, and an optional path to follow.
 
-    Without `path` it goes straight along its heading; with it, it follows the polyline (x, y) in metres. Without
-    phases it stands still. Vehicles reach their speed by full throttle or full brake, walkers at once.
+    Without `path` it goes straight along its heading; with it, it follows the polyline (x, y) in metres. It starts at
+    `speed` m/s and keeps that until its first phase begins. Vehicles reach the speed of a phase by full throttle or
+    full brake unless the phase says otherwise, walkers at once. `lateral` are lateral phases, which run at the same
+    time.
 
     With `trajectory`, rows of time s, x, y m and yaw rad, it follows these positions, linearly interpolated,
     regardless of the other agents; before the first and after the last row it is absent.
@@ -213,6 +382,8 @@ class Actor:
     lanes; a walker's own line), at `target_speed` m/s on a free road.
 
     `body` states dimensions and limits that differ from those of the model.
+
+    With `impact`, its pose and path follow from the place where it and the ego would collide; a file states neither.
     """
 
     name: str
@@ -224,15 +395,27 @@ class Actor:
     policy: str = ""
     target_speed: float = 8.0
     body: Body = Body()
+    speed: float = 0.0
+    lateral: tuple[LateralPhase, ...] = ()
+    impact: Impact | None = None
 
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Behaviour of the signals of an episode: those that face the ego's route, and all the others."""
+    """Behaviour of the signals of an episode.
+
+    Attributes:
+        ego: State of the signals that face the ego's route.
+        others: State of all the others.
+        until: Time at which the signals return to their programs, s.
+        elsewhere: If the ego has red at one junction alone (`forced_signals`): the state of the signals that face it
+            at the other junctions of its route. Where these are green, the others there are red.
+    """
 
     ego: Literal["program", "off", "red", "green"] = "program"
     others: Literal["program", "off", "red", "green"] = "program"
     until: float = 60.0
+    elsewhere: Literal["program", "off", "red", "green"] = "program"
 
 
 @dataclass(frozen=True)
@@ -305,8 +488,33 @@ class EpisodeLimits:
 
 
 @dataclass(frozen=True)
+class DeclaredParameter:
+    """Number that a scenario names, so that its keys can use it and sweeps, searches and repetitions vary it.
+
+    Attributes:
+        value: Value that it has if nothing varies it, or an expression of other parameters.
+        range: Minimum and maximum; searches cover it. None: no search varies the parameter.
+        spread: Maximum deviation of a repetition from the value at spread 1; None: that of the class's parameter of
+            this name, else 0.
+        unit: Unit of the values, "" for a plain number.
+        grid: Values of a sweep that takes the scenario's own grid.
+        doc: Meaning of the number.
+    """
+
+    value: float | str
+    range: tuple[float, float] | None = None
+    spread: float | None = None
+    unit: str = ""
+    grid: tuple[float, ...] = ()
+    doc: str = ""
+
+
+@dataclass(frozen=True)
 class Scenario:
     """A scenario as its author wrote it; round-trips through YAML.
+
+    Numbers that the author wrote as expressions have their values, and the expressions stand in `expressions`:
+    `ssad.scenarios.dynamic.with_parameters` evaluates them anew.
 
     Attributes:
         name: Name of the scenario.
@@ -325,6 +533,10 @@ class Scenario:
         seed: Seed of its random parts.
         group: Group that it belongs to in a set.
         source: Origin of the scenario.
+        declared: Parameters that the scenario declares itself; in YAML they stand among `parameters`.
+        expressions: Location of a number, such as `actors[0].phases[0].speed` -> its expression; in YAML it stands in
+            the place of the number.
+        constraints: Conditions on the parameters; sweeps, searches and repetitions leave out what violates one.
         ego_model: Name of the ego's model.
         ego_body: Dimensions and limits of the ego that differ from those of its model.
         friction: Coefficient of friction of the surface. Accelerations stay below friction * g, and the lateral grip
@@ -346,6 +558,9 @@ class Scenario:
     seed: int = 0
     group: str = ""
     source: str = ""
+    declared: Mapping[str, DeclaredParameter] = field(default_factory=dict)
+    expressions: Mapping[str, str] = field(default_factory=dict)
+    constraints: tuple[str, ...] = ()
     ego_model: str = "car"
     ego_body: Body = Body()
     friction: float = DEFAULT_FRICTION
@@ -390,6 +605,8 @@ class EpisodeAgent:
         policy: See `Actor`.
         body: Dimensions and limits that differ from those of the model.
         driver: Parameters of its driver under AUTOPILOT; None: those that all Autopilots have.
+        lateral: Lateral phases under SCRIPT; they need a route.
+        lateral_targets: Distance left of the route to which each lateral phase leads, at every route point [N], m.
     """
 
     name: str
@@ -404,6 +621,8 @@ class EpisodeAgent:
     trajectory: tuple[tuple[float, float, float, float], ...] = ()
     policy: str = ""
     body: Body = Body()
+    lateral: tuple[LateralPhase, ...] = ()
+    lateral_targets: tuple[F32, ...] = ()
     driver: DriverStyle | None = None
 
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.core.driving import Belief
-from ssad.core.types import F32, AgentKind, Bool
+from ssad.core.types import F32, F64, AgentKind, Bool
 
 RANGE = 100.0  # m
 OCCLUDERS = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS)
 MIN_OCCLUDING_PROP = 0.8  # m, minimum extent of a prop in both directions to occlude
 
 
-def is_visible(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
+def is_visible(eye: F32, belief: Belief, reach: float | F64 = RANGE) -> Bool:
     """Return which objects are visible.
 
     Args:
         eye: [B, 2] viewpoint, m.
         belief: The objects [B, K].
-        reach: Visual range, m.
+        reach: Visual range, m, of all viewpoints or of each [B].
 
     Returns:
         [B, K]; False for unused rows.
@@ -38,7 +38,7 @@ def is_visible(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
         np.isin(belief.kind, OCCLUDERS)
         | ((belief.kind == AgentKind.PROP) & (belief.size >= MIN_OCCLUDING_PROP).all(-1))
     )
-    unobstructed = np.hypot(*np.moveaxis(points - eye[:, None, None], -1, 0)) <= reach
+    unobstructed = np.hypot(*np.moveaxis(points - eye[:, None, None], -1, 0)) <= np.reshape(reach, (-1, 1, 1))
     for occluder in np.flatnonzero(occludes.any(0)).tolist():
         axes = np.stack([forward[:, occluder], lateral[:, occluder]], 1)  # [B, 2, 2]
         start = np.einsum("bij,bj->bi", axes, eye - belief.pose[:, occluder, :2])

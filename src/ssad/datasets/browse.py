@@ -20,7 +20,7 @@ from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import F64, U8
 from ssad.datasets.drawing import draw_edges
 from ssad.datasets.nuscenes.camera_truth import boxes_in_picture
-from ssad.datasets.nuscenes.files import read_frame_image, read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_frame_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 
@@ -175,7 +175,7 @@ def draw_top_view(root: Path, lidar: SensorFrame, annotations: Annotations) -> U
     """
     canvas: U8 = np.full((VIEW_SIZE, VIEW_SIZE, 3), GROUND, np.uint8)
     try:
-        sensor_points = read_points(root / lidar.filename)[:, :3].astype(np.float64)
+        sensor_points = read_frame_points(root, lidar)[:, :3].astype(np.float64)
     except SSADError:
         sensor_points = np.zeros((0, 3))
     draw_points(canvas, sensor_points @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3])

@@ -11,6 +11,8 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError
+from ssad.core.folders import data_path
+from ssad.core.import_report import ImportReport
 from ssad.core.types import F64, I32, Bool
 
 MAX_FILE_BYTES: Final = 1 << 30  # size limit of an annotation file
@@ -87,26 +89,32 @@ def coco_data(
     return {"info": dict(metadata), "images": image_rows, "annotations": annotation_rows, "categories": categories}
 
 
-def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
+def read_coco(path: Path, *, images: Path | None = None, report: ImportReport | None = None) -> CocoSet:
     """Read an annotation file.
 
     Args:
         path: The file.
         images: Folder of the pictures; by default `images` beside the file's folder if it exists, else the
             file's own folder.
+        report: Filled with what came in, what is not read, and what is doubtful: annotations of no image or category,
+            and boxes without width or height, as COCO's own files have them, which are left out; None: they raise.
 
     Returns:
         The pictures with their boxes.
 
     Raises:
         FormatError: A part is missing, malformed, or refers to an image or category that does not exist.
+        StoreError: A picture leads out of the folder (`ssad.core.folders.data_path`).
     """
     content = safeio.read_json(path, limit=MAX_FILE_BYTES)
     required_lists = ("images", "annotations", "categories")
     if not isinstance(content, dict) or any(not isinstance(content.get(key), list) for key in required_lists):
         raise FormatError(f"{path}: no COCO annotations (lists `images`, `annotations` and `categories`)")
     default_folder = path.parent.parent / "images"
-    folder = images or (default_folder if default_folder.is_dir() else path.parent)
+    if images is None and default_folder.is_dir():
+        data_path(path.parent.parent, "images")
+        images = default_folder
+    folder = images or path.parent
     try:
         class_names = {int(category["id"]): str(category["name"]) for category in content["categories"]}
         annotations_by_image: dict[int, list[Mapping[str, Any]]] = {
@@ -116,17 +124,44 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
             raise FormatError(f"{path}: two images or two categories of one id")
         for index, record in enumerate(content["annotations"]):
             if record["image_id"] not in annotations_by_image or record["category_id"] not in class_names:
-                raise FormatError(f"{path}: annotation {index} belongs to no image or category of the file")
-            annotations_by_image[record["image_id"]].append(record)
+                if report is None:
+                    raise FormatError(f"{path}: annotation {index} belongs to no image or category of the file")
+                report.doubt("annotations of no image or category are left out", f"annotation {index}")
+            elif report is not None and _is_empty(record):
+                report.doubt("boxes without width or height are left out", f"annotation {index}")
+            else:
+                annotations_by_image[record["image_id"]].append(record)
         # COCO ids may have gaps; labels count from 0 in the order of the ids.
         label_by_category = {category_id: key for key, category_id in enumerate(sorted(class_names))}
         pictures = tuple(
             _parse_image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
             for record in content["images"]
         )
+        _check_links(folder, pictures)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
+    if report is not None:
+        box_count = sum(len(picture.box) for picture in pictures)
+        report.contents.append(f"{len(pictures)} pictures with {box_count} boxes of {len(class_names)} classes")
+        for key in ("segmentation", "keypoints", "caption"):
+            if count := sum(bool(record.get(key)) for record in content["annotations"]):
+                report.omit(f"{key} of annotations", count=count)
     return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
+
+
+def _is_empty(annotation: Mapping[str, Any]) -> bool:
+    """Return whether the box of an annotation, as far as it is one, has no width or no height."""
+    box = annotation["bbox"]
+    return isinstance(box, list) and len(box) == 4 and min(float(box[2]), float(box[3])) <= 0.0
+
+
+def _check_links(folder: Path, pictures: Sequence[CocoImage]) -> None:
+    """Raise StoreError if a picture, or a folder of pictures, leads out of their folder."""
+    for parent in {picture.file.parent for picture in pictures} - {folder}:
+        data_path(folder, parent.relative_to(folder))
+    for picture in pictures:
+        if picture.file.is_symlink():
+            data_path(folder, picture.file.relative_to(folder))
 
 
 def _parse_image(

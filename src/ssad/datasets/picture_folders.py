@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import is_linkable, link_remedy
 from ssad.core.image_files import is_image
+from ssad.core.import_report import ImportReport
 from ssad.datasets.point_files import KITTI_COLUMNS, NUSCENES_COLUMNS
 
 Kind = Literal["image", "points", "label", "other", "link", "refused"]
@@ -55,8 +58,9 @@ class FolderFile:
 def list_folder(root: Path) -> list[FolderFile]:
     """Return every file below a folder, in the order of the keys.
 
-    Symbolic links are not followed: one that stays inside the folder is listed as a link, so nothing is listed twice
-    and no circle is walked; one that leads out of it, or nowhere, is refused.
+    A symbolic link that stays inside the folder is not followed but listed as a link, so nothing is listed twice and
+    no circle is walked. One that leads out of it is followed once where `SSAD_DATA_LINKS` allows it
+    (`ssad.core.folders.is_linkable`), and refused elsewhere, as is one that leads nowhere.
 
     Args:
         root: The folder; links above it are the user's own.
@@ -66,7 +70,7 @@ def list_folder(root: Path) -> list[FolderFile]:
     """
     resolved_root = root.resolve()
     files: list[FolderFile] = []
-    folders = [resolved_root]
+    folders, linked_folders = [resolved_root], set[Path]()
     while folders:
         folder = folders.pop()
         try:
@@ -78,9 +82,43 @@ def list_folder(root: Path) -> list[FolderFile]:
             path = Path(entry.path)
             if entry.is_dir(follow_symlinks=False):
                 folders.append(path)
-            else:
-                files.append(_describe(path, entry, resolved_root))
+                continue
+            file = _describe(path, entry, resolved_root)
+            if file.kind == "link" and not file.target:
+                destination = path.resolve()
+                if not any(destination.is_relative_to(folder) for folder in linked_folders):
+                    linked_folders.add(destination)
+                    folders.append(path)
+                    continue
+                file = replace(file, kind="refused", target="a symbolic link to a folder that is listed already")
+            files.append(file)
     return sorted(files, key=lambda file: file.key)
+
+
+def folder_report(root: Path) -> ImportReport:
+    """Return a report on a folder of pictures: what is read, and files that are not.
+
+    Raises:
+        StoreError: A folder cannot be read.
+    """
+    report = ImportReport(str(root))
+    files = list_folder(root)
+    counts = Counter(file.kind for file in files)
+    report.contents.append(f"{counts['image']} pictures, {counts['points']} point clouds")
+    for file in files:
+        if file.kind == "label":
+            report.omit("pictures in folders of labels", file.key)
+        elif file.kind == "other":
+            report.omit(f"files that are neither pictures nor point clouds: {_suffix(file)}", file.key)
+        elif file.kind == "link":
+            report.note("links to files of the folder stand for these", file.key)
+        elif file.kind == "refused":
+            report.doubt(f"not read: {file.target}", file.key)
+    return report
+
+
+def _suffix(file: FolderFile) -> str:
+    return file.path.suffix.lower()[:20] or "without a suffix"
 
 
 def _describe(path: Path, entry: os.DirEntry[str], root: Path) -> FolderFile:
@@ -89,11 +127,14 @@ def _describe(path: Path, entry: os.DirEntry[str], root: Path) -> FolderFile:
         destination = Path(os.path.realpath(path))
         if not destination.exists():
             return FolderFile(key, path, "refused", "a symbolic link that leads nowhere; remove it")
-        if not destination.is_relative_to(root):
-            reason = f"a symbolic link that leads out of {root}; put what it leads to in its place"
+        if destination.is_relative_to(root):
+            return FolderFile(key, path, "link", destination.relative_to(root).as_posix())
+        if not is_linkable(destination):
+            reason = f"a symbolic link that leads out of {root}; {link_remedy(destination)}"
             return FolderFile(key, path, "refused", reason)
-        return FolderFile(key, path, "link", destination.relative_to(root).as_posix())
-    if not entry.is_file(follow_symlinks=False):
+        if destination.is_dir():
+            return FolderFile(key, path, "link")
+    if not entry.is_file():
         return FolderFile(key, path, "refused", "neither a file nor a folder; remove it")
     try:
         return FolderFile(key, path, _kind(path, key.split("/")[:-1]))

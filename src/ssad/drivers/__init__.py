@@ -26,6 +26,7 @@ SYSTEMS: dict[str, str] = {
     "careful-reg157": "ssad.drivers.careful.driver:CarefulReg157",
     "careful-rss": "ssad.drivers.careful.driver:CarefulRSS",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
+    "no-action": "ssad.drivers.builtin:NoAction",
     "perceiving": "ssad.drivers.perceiving.systems:ComposedSystem",
     "perceiving-perfect": "ssad.drivers.perceiving.systems:PerfectSystem",
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",

@@ -1,4 +1,4 @@
-"""Driving systems that run inside the world: the privileged Autopilot and the blind route follower."""
+"""Driving systems that run inside the world: the privileged Autopilot and route followers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Blind:
 
     name = "blind"
     controller = Controller.FOLLOW
-    target_speed = 10.0
+    target_speed: float | None = 10.0
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Do nothing: the follower runs inside the world."""
@@ -38,3 +38,13 @@ class Blind:
     def act(self, view: Observation) -> F32:
         """Raise RuntimeError: the follower runs inside the world."""
         raise RuntimeError("the blind follower runs inside the world")
+
+
+class NoAction(Blind):
+    """Route follower at the scenario's target speed (slower in bends) that ignores all other agents: no action.
+
+    The baseline of test protocols, in which the ego holds the test speed up to the impact.
+    """
+
+    name = "no-action"
+    target_speed = None

@@ -61,6 +61,18 @@ class SuiteBase(schema.Schema):
         """Return the suite with its files resolved: in the working folder, else beside the suite's own file."""
         return self
 
+    def error(self, location: Sequence[str | int], message: str) -> ConfigError:
+        """Return an error of a key that shows when scenarios or data are read.
+
+        It names the line of the key where the suite comes from a file that has it.
+        """
+        path = Path(self._origin)
+        if path.is_file():
+            document = safeio.read_yaml_document(path)
+            if tuple(location) in document.lines:
+                return document.error(location, message)
+        return ConfigError(f"suite {self.name}: {safeio.format_location(location)}: {message}")
+
 
 @dataclass(frozen=True)
 class Column:
@@ -312,6 +324,10 @@ class Kind(ABC):
             job: Data that the workers of the run share.
         """
         raise CellError(f"the kind {self.name} names pieces of work, but not how they are made")
+
+    def plan_lines(self, plan: Plan) -> list[str]:
+        """Return lines about the cells of a plan for `ssad plan` and `--dry-run`, besides their numbers."""
+        return []
 
     def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default
         """Write pictures for the report, in the main process, when all cells have run."""

@@ -68,7 +68,7 @@ def select_cells(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
     Raises:
         ConfigError: No cell has such a field or value.
     """
-    rows = [{"name": cell.name} | {key: str(value) for key, value in cell.fields.items()} for cell in plan.cells]
+    rows = [{"name": cell.name} | {key: _text(value) for key, value in cell.fields.items()} for cell in plan.cells]
     selected = list(zip(plan.cells, rows, strict=True))
     for field, texts in only.items():
         field_values = dict.fromkeys(row[field] for row in rows if field in row)
@@ -85,6 +85,11 @@ def select_cells(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
         condition = " and ".join(f"{field}={','.join(map(str, texts))}" for field, texts in only.items())
         raise ConfigError(f"no cell has {condition} at once")
     return [cell for cell, _ in selected]
+
+
+def _text(value: Any) -> str:
+    """Return the value of a field as one writes it: 10 and not 10.0."""
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def run_json(plan: Plan) -> dict[str, Any]:

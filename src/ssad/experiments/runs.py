@@ -18,6 +18,7 @@ from ssad.experiments.suites import kind_of
 from ssad.report.join import join_runs
 from ssad.report.load import Run, load_run, read_as_kind
 from ssad.report.markdown import run_markdown
+from ssad.report.matrix import run_matrices, sweep_tables, terminal_matrices
 from ssad.report.pages import TABLE_HASH, table_hash
 from ssad.report.tables import write_tables
 from ssad.report.terminal import TerminalTable, terminal_table
@@ -97,7 +98,8 @@ def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
     run = load_run(folder)
     with read_as_kind(run):
         page, tables = (kind or kind_of_run(run)).page(run)
-    write_tables(run.folder, tables)
+        all_tables = [*tables, *sweep_tables(run)]
+    write_tables(run.folder, all_tables)
     page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
@@ -118,7 +120,7 @@ def report_markdown(folders: Sequence[Path | str]) -> str:
     kind = kind_of_run(run)
     with read_as_kind(run):
         _, tables = kind.page(run)
-        return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
+        return run_markdown(run, [*tables, *run_matrices(run)], complete_verdict(run, kind.verdict(run)))
 
 
 def summary(folder: Path | str, kind: Kind | None = None) -> TerminalTable:
@@ -134,3 +136,14 @@ def summary(folder: Path | str, kind: Kind | None = None) -> TerminalTable:
     run = load_run(folder)
     with read_as_kind(run):
         return terminal_table(run, (kind or kind_of_run(run)).summary(run))
+
+
+def matrices(folder: Path | str) -> list[TerminalTable]:
+    """Return the matrices of a run with a sweep for the terminal; empty: it has no sweep.
+
+    Raises:
+        StoreError: The folder holds no run with results.
+    """
+    run = load_run(folder)
+    with read_as_kind(run):
+        return terminal_matrices(run)

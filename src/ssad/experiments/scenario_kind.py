@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
 
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.errors import ConfigError, UnknownNameError, unknown_name
 from ssad.core.folders import path_inside
 from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.machine import start_warp_quietly
@@ -29,6 +32,26 @@ from ssad.simulators.closed_loop import (
     type_version,
 )
 
+if TYPE_CHECKING:
+    from ssad.scenarios.dynamic.parameters import GridPoint
+
+DECLARED_GRID = "grid"
+"""Entry of a sweep that stands for the grid which the scenario declares."""
+SWEEP = "sweep."
+"""Start of the names of the fields of cells and records that have the values of swept parameters."""
+
+
+def _check_grid(entry: Any) -> Any:
+    """Return an entry of a sweep. ValueError, for pydantic, if it is no grid."""
+    from ssad.scenarios.dynamic.parameters import grid_values
+
+    if entry != DECLARED_GRID:
+        try:
+            grid_values(entry)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+    return entry
+
 
 class ScenarioSuite(SuiteBase):
     """Keys of suites that drive scenarios.
@@ -38,10 +61,31 @@ class ScenarioSuite(SuiteBase):
             that simulator's intersection and highway.
         cluster: What is drawn independently of one another, for the intervals: towns' routes, each of which may have
             several scenarios, or scenarios.
+        sweep: Parameter of the scenarios -> its values: a list, {from: 0, to: 1, step: 0.25}, {from: 0, to: 1,
+            count: 5}, or grid for those that the scenario declares. Each point of the grid is a scenario
+            (docs/how-to/sweep-parameters.md).
+        sweep_mode: Whether all combinations of the values are points (product), or the first values make the first
+            point, the second ones the second, and so on (zip).
+        matrix: Parameters in the rows and the columns of the matrix table; empty: the first two of the sweep that have
+            several values.
+        matrix_metric: Metric that it shows; empty: collisions.
     """
 
     scenarios: Names
     cluster: Literal["route", "scenario"] = "route"
+    sweep: dict[str, Annotated[Any, AfterValidator(_check_grid)]] = Field(default={})
+    sweep_mode: Literal["product", "zip"] = "product"
+    matrix: Annotated[list[str], Field(max_length=2)] = Field(default=[])
+    matrix_metric: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_matrix(cls, data: Any) -> Any:
+        """Fill in the default of `matrix`: records of a run keep the order of a list, not that of a mapping."""
+        if not isinstance(data, dict) or data.get("matrix") or not isinstance(data.get("sweep"), dict):
+            return data
+        several = [name for name, entry in data["sweep"].items() if not (isinstance(entry, list) and len(entry) == 1)]
+        return {**data, "matrix": (several or list(data["sweep"]))[:2]}
 
     def beside(self, path: Path) -> Self:
         """Return the suite with its scenario files resolved: in the working folder, then beside the suite."""
@@ -65,11 +109,21 @@ def route_key(scenario: Scenario) -> str:
 
 @dataclass(frozen=True, slots=True)
 class DescribedScenario:
-    """A scenario of a suite, as plain data, with the versions of its town, its type and its actors' drivers."""
+    """A scenario of a suite, as plain data, with the versions of its town, its type and its actors' drivers.
+
+    Attributes:
+        scenario: The scenario.
+        data: Its plain data.
+        versions: The versions.
+        nominal: The scenario that a sweep varies; the scenario itself without a sweep.
+        point: Values of swept parameters.
+    """
 
     scenario: Scenario
     data: dict[str, Any]
     versions: tuple[str, ...]
+    nominal: Scenario
+    point: Mapping[str, float]
 
 
 class ScenarioKind(Kind):
@@ -99,14 +153,48 @@ class ScenarioKind(Kind):
             spec: Data for the worker besides scenario and system.
         """
         kind, *seed_parts = chance
-        seed = seed32(kind, suite.seed, safeio.dump_json(described_scenario.data), *seed_parts)
-        scenario = described_scenario.scenario
-        cluster = scenario.name if suite.cluster == "scenario" else route_key(scenario)
-        identification = {"system": system, "group": scenario.group or scenario.type, "cluster": cluster}
+        scenario, nominal = described_scenario.scenario, described_scenario.nominal
+        # All points of a grid have the seed and the cluster of the nominal scenario: they differ in what is swept, and
+        # are no independent draws.
+        seed_data = described_scenario.data if nominal is scenario else scenario_json(nominal)
+        seed = seed32(kind, suite.seed, safeio.dump_json(seed_data), *seed_parts)
+        cluster = nominal.name if suite.cluster == "scenario" else route_key(nominal)
+        identification: dict[str, Any] = {
+            "system": system,
+            "group": scenario.group or scenario.type,
+            "cluster": cluster,
+        }
+        if described_scenario.point:
+            identification["swept"] = nominal.name
+            identification |= {f"{SWEEP}{name}": value for name, value in described_scenario.point.items()}
         cell_spec = {"scenario": described_scenario.data, "system": system, **spec}
         return self.make_cell(
             title, system, seed, {**identification, **(fields or {})}, cell_spec, *described_scenario.versions, *inputs
         )
+
+    def plan_lines(self, plan: Plan) -> list[str]:
+        """Return the size of the sweep of a plan; without a sweep nothing."""
+        suite = plan.suite
+        if not suite.sweep:
+            return []
+        from ssad.scenarios.dynamic.parameters import grid_values
+
+        points = {cell.spec["scenario"]["name"]: cell.fields for cell in plan.cells}
+        scenario_count = len({fields["swept"] for fields in points.values()})
+        sizes = {
+            name: len({fields[f"{SWEEP}{name}"] for fields in points.values()})
+            if entry == DECLARED_GRID
+            else len(grid_values(entry))
+            for name, entry in suite.sweep.items()
+        }
+        is_zip = suite.sweep_mode == "zip"
+        total = scenario_count * (min(sizes.values()) if is_zip else math.prod(sizes.values()))
+        size_text = (" with " if is_zip else " x ").join(f"{name} {size}" for name, size in sizes.items())
+        scenario_text = "" if scenario_count == 1 else f" of {scenario_count} scenarios"
+        # Grids that several scenarios declare may have different sizes.
+        is_complete = DECLARED_GRID not in suite.sweep.values() and total > len(points)
+        left_out = f"; {total - len(points)} more violate a constraint or are not selected" if is_complete else ""
+        return [f"sweep: {len(points)} grid points{scenario_text} ({size_text} values){left_out}"]
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Store copies of the towns beside the results, so that a report can be made where they are not imported."""
@@ -148,23 +236,56 @@ def drive_record(cell: Cell, episode: Episode, trace: EpisodeTrace, folder: Path
     return {"metrics": metrics, "artefacts": {"trace": artefact}, "episode": episode_fields, "case": motion_hash(trace)}
 
 
-def describe_scenarios(suite: ScenarioSuite) -> tuple[list[DescribedScenario], dict[str, str]]:
+def describe_scenarios(suite: ScenarioSuite, metrics: Iterable[str]) -> tuple[list[DescribedScenario], dict[str, str]]:
     """Return all scenarios of a suite, in order, and the versions of their towns.
+
+    Args:
+        suite: The suite.
+        metrics: Metrics of the kind, which a matrix table can show.
 
     Raises:
         ConfigError: There are no such scenarios, or two differ but share a name.
     """
-    scenarios = suite_scenarios(suite)
-    towns = {name: town_version(cached_town(name)) for name in sorted({scenario.town for scenario in scenarios})}
-    entries = []
-    for scenario in scenarios:
-        policies = [system_version(name) for name in policies_of(scenario)]
-        entries.append(
-            DescribedScenario(
-                scenario, scenario_json(scenario), (towns[scenario.town], type_version(scenario.type), *policies)
+    for name in suite.matrix:
+        if name not in suite.sweep:
+            raise suite.error(
+                ("matrix",), f"'{name}' is not swept; the sweep has: {', '.join(suite.sweep) or 'nothing'}"
             )
-        )
+    if suite.matrix_metric and suite.matrix_metric not in metrics:
+        raise suite.error(("matrix_metric",), str(unknown_name("metric", suite.matrix_metric, metrics)))
+    nominal_scenarios = suite_scenarios(suite)
+    towns = {
+        name: town_version(cached_town(name)) for name in sorted({scenario.town for scenario in nominal_scenarios})
+    }
+    entries = []
+    for nominal in nominal_scenarios:
+        policies = [system_version(name) for name in policies_of(nominal)]
+        versions = (towns[nominal.town], type_version(nominal.type), *policies)
+        if not suite.sweep:
+            entries.append(DescribedScenario(nominal, scenario_json(nominal), versions, nominal, {}))
+        entries += [
+            DescribedScenario(point.scenario, scenario_json(point.scenario), versions, nominal, point.values)
+            for point in (swept_points(suite, nominal) if suite.sweep else ())
+        ]
     return entries, towns
+
+
+def swept_points(suite: ScenarioSuite, scenario: Scenario) -> tuple[GridPoint, ...]:
+    """Return a scenario at the points of a suite's sweep that meet its constraints.
+
+    Raises:
+        ConfigError: A parameter is unknown, or a value is out of its range; the message names the key, and its line
+            where the suite has a file.
+    """
+    from ssad.scenarios.dynamic.parameters import GridError, grid_points, grid_values
+
+    # In the order of the alphabet: a suite that is read from a run's record must give the same names.
+    entries = sorted(suite.sweep.items())
+    grids = {name: None if entry == DECLARED_GRID else grid_values(entry) for name, entry in entries}
+    try:
+        return grid_points(scenario, grids, zipped=suite.sweep_mode == "zip")
+    except GridError as error:
+        raise suite.error(("sweep", *filter(None, [error.name])), str(error)) from None
 
 
 def suite_scenarios(suite: ScenarioSuite) -> tuple[Scenario, ...]:

@@ -6,18 +6,19 @@ The middle of its bounds is the centre line of a lane, and lanes side by side fo
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, LaneType, SignalState
 from ssad.interchange import commonroad_xml as xml
-from ssad.interchange.commonroad_xml import TextReader
+from ssad.interchange.commonroad_xml import TextReader, element_name
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -46,14 +47,14 @@ class ImportedLanes:
     cycles: int
 
 
-def read_lanes(root: Element, texts: TextReader, name: str, omissions: Counter[str]) -> ImportedLanes:
+def read_lanes(root: Element, texts: TextReader, name: str, report: ImportReport) -> ImportedLanes:
     """Build the lane graph of a file's lanelets.
 
     Args:
         root: The document.
         texts: Reads its texts.
         name: Name of the town.
-        omissions: Counter of the features that are not carried over.
+        report: Filled with what came in, what is not carried over, and what is doubtful.
 
     Raises:
         FormatError: Lanelets are broken, or have dangling references.
@@ -79,7 +80,7 @@ def read_lanes(root: Element, texts: TextReader, name: str, omissions: Counter[s
             raise texts.error(element, "there are two of this id")
         lane_of[lanelet_id] = lane_index
     return _LaneletReader(
-        texts, omissions, lanelets, lane_of, [types_by_element[id(lanelet)] for lanelet in lanelets]
+        texts, report, lanelets, lane_of, [types_by_element[id(lanelet)] for lanelet in lanelets]
     ).read(root, name, crosswalks)
 
 
@@ -87,12 +88,12 @@ class _LaneletReader:
     def __init__(
         self,
         texts: TextReader,
-        omissions: Counter[str],
+        report: ImportReport,
         lanes: list[Element],
         lane_of: dict[int, int],
         kinds: list[list[str]],
     ) -> None:
-        self.texts, self.omissions, self.lanes, self.lane_of, self.kinds = texts, omissions, lanes, lane_of, kinds
+        self.texts, self.report, self.lanes, self.lane_of, self.kinds = texts, report, lanes, lane_of, kinds
 
     def read(self, root: Element, name: str, walks: list[Element]) -> ImportedLanes:
         shapes = self.shapes = [self._shape(element) for element in self.lanes]
@@ -141,7 +142,14 @@ class _LaneletReader:
             **self._signs(root, shapes, "trafficSign"),
             **self._signals(root, shapes, junction, successors),
         )
+        self._note_other_uses()
         return ImportedLanes(self.graph, self.lane_of, self.states, self.cycles)
+
+    def _note_other_uses(self) -> None:
+        """Add to the report the uses of lanelets that a lane has not."""
+        for element, names in zip(self.lanes, self.kinds, strict=True):
+            if element.find("userBidirectional") is not None and _kind(names) == LaneType.DRIVING:
+                self.report.omit("traffic in the second direction of lanelets that have two", element_name(element))
 
     def _shape(self, element: Element) -> F64:
         """Return [N, 6] x, y, z, yaw, width, s of a lanelet."""
@@ -149,7 +157,9 @@ class _LaneletReader:
         if min(len(side) for side in sides) < 2:
             raise self.texts.error(element, "a bound has fewer than two points")
         if len(sides[0]) != len(sides[1]):
-            self.omissions["lanelets whose bounds have different numbers of points are resampled"] += 1
+            self.report.note(
+                "lanelets whose bounds have different numbers of points are resampled", element_name(element)
+            )
             sides = [_resample(side, max(map(len, sides))) for side in sides]
         middle = 0.5 * (sides[0] + sides[1])
         spacing = np.hypot(*np.diff(middle[:, :2], axis=0).T)
@@ -290,7 +300,9 @@ class _LaneletReader:
             )
             unsupported = sorted(set(sign_names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
             for name in unsupported:
-                self.omissions[f"traffic sign {name[:20]}"] += 1
+                self.report.omit(f"traffic sign {name[:20]}", element_name(sign))
+            if kind is not None and not lanes:
+                self.report.doubt("signs that no lanelet refers to are left out", element_name(sign))
             if kind is None or not lanes:
                 continue
             end = shapes[lanes[0][0]][-1]
@@ -320,7 +332,7 @@ class _LaneletReader:
             lanes = lanes_by_light.get(self.texts.whole(light.get("id"), light, "id"), [])
             cycle = self._cycle(light)
             if not lanes:
-                self.omissions["traffic lights that no lanelet refers to"] += 1
+                self.report.doubt("traffic lights that no lanelet refers to are left out", element_name(light))
                 continue
             signal_number = len(signal_rows)
             if len({state for _, state in cycle[:-1]}) == 1:

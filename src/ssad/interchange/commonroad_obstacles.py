@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ssad.core.import_report import ImportReport
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import Actor, AgentKind, EpisodeLimits, Pose
-from ssad.interchange.commonroad_xml import KINDS_OF, STEP, TextReader
+from ssad.interchange.commonroad_xml import KINDS_OF, STEP, TextReader, element_name
 from ssad.world.episode_arrays import MAX_AGENTS
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, SURROGATES
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -23,10 +23,10 @@ _VEHICLES = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE
 
 
 class ObstacleReader:
-    """The obstacles of a document whose steps last `dt` s; inexact conversions are counted in `omissions`."""
+    """The obstacles of a document whose steps last `dt` s; inexact conversions go into a report."""
 
-    def __init__(self, texts: TextReader, omissions: Counter[str], dt: float) -> None:
-        self.texts, self.omissions, self.dt = texts, omissions, dt
+    def __init__(self, texts: TextReader, report: ImportReport, dt: float) -> None:
+        self.texts, self.report, self.dt = texts, report, dt
 
     def read(self, root: Element, start: Pose, limits: EpisodeLimits) -> tuple[Actor, ...]:
         """Return the actors in the order of their ids.
@@ -50,16 +50,20 @@ class ObstacleReader:
                 known_ids.add(obstacle_id)
                 actor = convert(element, end_time)
                 if actor is not None and self._is_ego(actor, start):
-                    self.omissions["an obstacle that is the ego's own recording: it starts where the ego does"] += 1
+                    self.report.omit(
+                        "an obstacle that is the ego's own recording: it starts where the ego does",
+                        element_name(element),
+                    )
                 elif actor is not None:
                     rows = np.array(actor.trajectory or [(0.0, actor.pose.x, actor.pose.y, 0.0)])
                     distance = float(np.hypot(rows[:, 1] - start.x, rows[:, 2] - start.y).min())
                     actors[obstacle_id] = distance, actor
         nearest_ids = sorted(actors, key=lambda obstacle_id: actors[obstacle_id][0])[: MAX_AGENTS - 1]
         if excess := len(actors) - len(nearest_ids):
-            self.omissions[
-                f"{excess} obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start"
-            ] += 1
+            self.report.omit(
+                f"obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start", count=excess
+            )
+        self.report.contents.append(f"{len(nearest_ids)} obstacles")
         return tuple(actors[obstacle_id][1] for obstacle_id in sorted(nearest_ids))
 
     @staticmethod
@@ -80,10 +84,15 @@ class ObstacleReader:
         if not kinds:
             raise self.texts.error(element, f"'{type_name[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
         size = self._size(element)
-        candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
+        candidates = [
+            candidate for name, candidate in MODELS.items() if candidate.kind in kinds and name not in SURROGATES
+        ]
         model = min(candidates, key=lambda candidate: abs(candidate.length - size[0]) + abs(candidate.width - size[1]))
         if max(abs(model.length - size[0]), abs(model.width - size[1])) > 0.01:
-            self.omissions[f"the body of a {type_name} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{model.name}'"] += 1
+            self.report.omit(
+                f"the body of a {type_name} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{model.name}'",
+                element_name(element),
+            )
         return type_name, model.name
 
     def _size(self, element: Element) -> tuple[float, float]:
@@ -108,7 +117,7 @@ class ObstacleReader:
         if not (0.0 < length < 1e4 and 0.0 < width < 1e4):
             raise self.texts.error(element, f"its body is {length:g} x {width:g} m")
         if outline.tag != "rectangle" or outline.find("center") is not None or len(shape) > 1:
-            self.omissions["bodies that are no rectangle about their middle"] += 1
+            self.report.omit("bodies that are no rectangle about their middle", element_name(element))
         return length, width
 
     def _static_actor(self, element: Element, until: float) -> Actor | None:
@@ -124,9 +133,12 @@ class ObstacleReader:
         if start is None:
             raise self.texts.error(element, "initialState is missing")
         name = f"{type_name}-{element.get('id')}"
+        for tag in ("initialSignalState", "signalSeries"):
+            if element.find(tag) is not None:
+                self.report.omit(f"{tag}: the lamps of obstacles", element_name(element))
         regions = element.findall("occupancySet/occupancy")
         if regions:
-            self.omissions["occupancy sets: their middles are taken as a trajectory"] += 1
+            self.report.omit("occupancy sets: their middles are taken as a trajectory", element_name(element))
         pose_by_time: dict[float, tuple[float, float, float]] = {}
         pose = self.pose(start, element)
         for state in (start, *element.findall("trajectory/state"), *regions):
@@ -135,7 +147,7 @@ class ObstacleReader:
             if time < last_time:
                 raise self.texts.error(element, f"time {time / self.dt:g} does not come after the one before it")
             if time == last_time:
-                self.omissions["states of a step that has one already"] += 1
+                self.report.doubt("states of a step that has one already are left out", element_name(element))
                 continue
             pose = self._middle_of(state, element, pose) if state.tag == "occupancy" else self.pose(state, element)
             pose_by_time[time] = pose.x, pose.y, pose.yaw
@@ -158,7 +170,7 @@ class ObstacleReader:
             if centre is None:
                 raise self.texts.error(within, f"a position that is a {position[0].tag[:40]} is not read")
             x, y = (self.texts.number(centre.findtext(axis), within, f"position: {axis}") for axis in "xy")
-            self.omissions["positions that are regions: their middle is taken"] += 1
+            self.report.omit("positions that are regions: their middle is taken", element_name(within))
         return Pose(x, y, float(wrap_angle(self.middle(state, "orientation", within, None))))
 
     def _middle_of(self, occupancy: Element, within: Element, previous_pose: Pose) -> Pose:
@@ -185,5 +197,5 @@ class ObstacleReader:
             return default
         low, high = self.texts.value(element, within, tag)
         if low != high:
-            self.omissions[f"intervals of {tag}: their middle is taken"] += 1
+            self.report.omit(f"intervals of {tag}: their middle is taken", element_name(within))
         return 0.5 * (low + high)

@@ -1,14 +1,13 @@
 """CommonRoad files as scenarios: obstacles replay their trajectories, and the ego gets the planning problem.
 
 XML 2020a is read here, protobuf and XML 2018b through commonroad-io. If the lanelets are those of an existing town,
-the scenario takes place in that town; else they become a town. Features without a counterpart are listed in
-`ImportedCommonRoad.omissions`.
+the scenario takes place in that town; else they become a town. Features without a counterpart are named
+in a report.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, MapError, RouteError
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import MIB, read_xml
@@ -32,6 +32,7 @@ from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.roads import is_town, load_town, route_along, town_names
+from ssad.world.roads.graph_report import describe
 from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
@@ -51,22 +52,23 @@ class ImportedCommonRoad:
         scenario: The scenario.
         graph: Its town.
         is_known_town: Whether the town can be loaded by its name; else the graph must be stored.
-        omissions: Features of the file that are not carried over, one line each.
     """
 
     scenario: Scenario
     graph: LaneGraph
     is_known_town: bool
-    omissions: tuple[str, ...]
 
 
-def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None = None) -> ImportedCommonRoad:
+def read_commonroad(
+    path: Path, *, town: str | None = None, map_name: str | None = None, report: ImportReport | None = None
+) -> ImportedCommonRoad:
     """Read the scenario of a file.
 
     Args:
         path: The file.
         town: Name for a town made of its lanelets; None: the name of the file.
         map_name: Its town, or a file of that town, instead of its lanelets.
+        report: Filled with what came in, what is not carried over, and what is doubtful.
 
     Raises:
         FormatError: The file is broken, or is not a CommonRoad scenario.
@@ -87,7 +89,10 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
             root = convert(path, protobuf=False, limit=MAX_BYTES)
         elif version != VERSION:
             raise FormatError(f"{location}: commonRoadVersion is '{version[:20]}'; {VERSION} and {OLDER} are read")
-    reader = _Reader(location, root)
+    account = ImportReport(location) if report is None else report
+    version = root.get("commonRoadVersion", "")
+    account.contents.append(f"CommonRoad {version[:12]}, benchmark {root.get('benchmarkID', '')[:60] or 'without id'}")
+    reader = _Reader(location, root, account)
     try:
         return reader.read(Path(path).stem, town or Path(path).stem, map_name)
     except (MapError, RouteError, ConfigError) as error:
@@ -96,17 +101,16 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
 
 
 class _Reader:
-    def __init__(self, location: str, root: Element) -> None:
-        self.root, self.texts = root, TextReader(location)
-        self.omissions: Counter[str] = Counter()
+    def __init__(self, location: str, root: Element, report: ImportReport) -> None:
+        self.root, self.texts, self.report = root, TextReader(location), report
         self.own_values = parse_source(root.get("source", ""))
         self.dt = self.texts.number(root.get("timeStepSize"), root, "timeStepSize")
         if not 0.0 < self.dt <= 10.0:
             raise self.texts.error(root, f"timeStepSize is {self.dt:g} s")
-        self.obstacles = ObstacleReader(self.texts, self.omissions, self.dt)
+        self.obstacles = ObstacleReader(self.texts, report, self.dt)
 
     def read(self, stem: str, town: str, map_name: str | None) -> ImportedCommonRoad:
-        """Return the scenario, checked, and the features that are not carried over."""
+        """Return the scenario, checked."""
         lanes, graph, is_known, town_name = self._town(town, map_name)
         problem = self._problem()
         start, speed = self._start(problem)
@@ -128,19 +132,15 @@ class _Reader:
         )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
-                self.omissions[tag] += count
+                self.report.omit(tag.rpartition("/")[2], count=count)
         build_episode(scenario, graph, seed=0)  # reports any remaining error of the scenario
-        omissions = tuple(
-            f"{message}{f' ({occurrences} times)' if occurrences > 1 else ''}"
-            for message, occurrences in self.omissions.items()
-        )
-        return ImportedCommonRoad(scenario, graph, is_known, omissions)
+        return ImportedCommonRoad(scenario, graph, is_known)
 
     # ------------------------------------------------------------ the town
 
     def _town(self, town: str, map_name: str | None) -> tuple[ImportedLanes, LaneGraph, bool, str]:
         """Return the file's lanes, the town, whether the town can be loaded by name, and its name."""
-        lanes = read_lanes(self.root, self.texts, town, self.omissions)
+        lanes = read_lanes(self.root, self.texts, town, self.report)
         if map_name is not None:
             is_known = is_town(map_name)
             graph = load_town(map_name)
@@ -154,7 +154,9 @@ class _Reader:
             if benchmark_map(name) == label and _same_lanes(load_town(name), lanes.graph):
                 return lanes, load_town(name), True, name
         if lanes.cycles:
-            self.omissions[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
+            self.report.omit(f"the cycles of {lanes.cycles} traffic lights: they run this program's own")
+        names = {lane: f"lanelet {lanelet}" for lanelet, lane in lanes.lane_of.items()}
+        describe(lanes.graph, f"{lanes.graph.lane_count} lanelets", self.report, names.__getitem__)
         return lanes, lanes.graph, False, town
 
     def _signals(self, lanes: ImportedLanes, graph: LaneGraph, line: Route, limits: EpisodeLimits) -> SignalPlan:
@@ -174,7 +176,7 @@ class _Reader:
             end_time = self.texts.number(self.own_values["signals_until"], self.root, "source: signals_until")
         plan = plan_of(graph, line, forced_states, end_time) if len(forced_states) == len(lanes.states) else None
         if plan is None:
-            self.omissions[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
+            self.report.omit(f"the states of {len(lanes.states)} signals, which no signal plan here gives")
         return plan or SignalPlan()
 
     # ------------------------------------------------------------ the ego
@@ -184,7 +186,7 @@ class _Reader:
         if not problems:
             raise self.texts.error("commonRoad", "it has no planningProblem: nothing says where the ego goes")
         if len(problems) > 1:
-            self.omissions[f"{len(problems) - 1} more planning problems: the first is driven"] += 1
+            self.report.omit("further planning problems: the first is driven", count=len(problems) - 1)
         return problems[0]
 
     def _start(self, problem: Element) -> tuple[Pose, float]:
@@ -196,7 +198,7 @@ class _Reader:
         if speed < 0.0:
             raise self.texts.error(problem, f"it starts with {speed:g} m/s")
         if self.obstacles.middle(state, "time", problem, 0.0) != 0.0:
-            self.omissions["the step at which the planning problem begins: it is step 0"] += 1
+            self.report.omit("the step at which the planning problem begins: it is step 0")
         return pose, min(speed, MAX_SPEED)
 
     def _goal(self, problem: Element, lanes: ImportedLanes, speed: float) -> tuple[EpisodeLimits, Pose | None, float]:
@@ -205,16 +207,16 @@ class _Reader:
         if not goals:
             raise self.texts.error(problem, "goalState is missing")
         if len(goals) > 1:
-            self.omissions[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
+            self.report.omit("further goal states: the first is the goal", count=len(goals) - 1)
         goal = goals[0]
         begin_step, end_step = self.texts.value(goal.find("time"), problem, "goalState: time")
         steps = round(end_step * self.dt / STEP)
         if steps < 1:
             raise self.texts.error(problem, f"its goal is to be reached at step {end_step:g}")
         if begin_step > 0.0:
-            self.omissions["the earliest time of the goal"] += 1
+            self.report.omit("the earliest time of the goal")
         if goal.find("orientation") is not None:
-            self.omissions["the orientation of the goal"] += 1
+            self.report.omit("the orientation of the goal")
         limits = EpisodeLimits(max_steps=steps, max_time=max(EpisodeLimits().max_time, steps * STEP))
         if self.own_values.get("contact") in ("end", "count", "remove"):
             limits = replace(limits, contact=self.own_values["contact"])  # type: ignore[arg-type]
@@ -225,12 +227,12 @@ class _Reader:
         if (velocity := goal.find("velocity")) is not None:
             min_speed, target_speed = self.texts.value(velocity, problem, "goalState: velocity")
             if min_speed > 0.0:
-                self.omissions["the least speed at the goal"] += 1
+                self.report.omit("the least speed at the goal")
         elif speed > 1.0:
             target_speed = speed
         if not 0.1 <= target_speed <= MAX_SPEED:
             target_speed = min(max(target_speed, Scenario.target_speed), MAX_SPEED)
-            self.omissions[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
+            self.report.omit(f"the speed at the goal: the ego drives at {target_speed:g} m/s")
         return limits, self._region(goal.find("position"), problem, lanes), target_speed
 
     def _region(self, position: Element | None, problem: Element, lanes: ImportedLanes) -> Pose | None:
@@ -238,7 +240,7 @@ class _Reader:
         if position is None or not len(position):
             return None
         if len(position) > 1:
-            self.omissions["more than one goal region: the first is the goal"] += 1
+            self.report.omit("more than one goal region: the first is the goal")
         region = position[0]
         if region.tag == "lanelet":
             lanelet_id = self.texts.whole(region.get("ref"), problem, "goalState: lanelet")
@@ -262,7 +264,7 @@ class _Reader:
     def _route(self, graph: LaneGraph, start: Pose, goal: Pose | None) -> tuple[tuple[Pose, ...], Route]:
         """Return the key points of the ego's route, and the route."""
         if goal is None:
-            self.omissions[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
+            self.report.note(f"the ego has no place to reach: its route is {WAY:g} m along its lane")
             return self._route_ahead(graph, start)
         try:
             ego_route = route_along(graph, (start, (goal.x, goal.y)))
@@ -271,7 +273,7 @@ class _Reader:
         except RouteError as error:
             if _lane_under(graph, start) is None or "no way" not in str(error):
                 raise RouteError(f"{self.texts.location}: the way of the ego: {error}") from None
-        self.omissions[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
+        self.report.doubt(f"no way along the lanes leads to the goal: the route is {WAY:g} m along the ego's lane")
         return self._route_ahead(graph, start)
 
     def _route_ahead(self, graph: LaneGraph, start: Pose) -> tuple[tuple[Pose, ...], Route]:

@@ -86,6 +86,12 @@ def add_element(parent: Element, tag: str, text: Any = None, **attributes: Any) 
     return element
 
 
+def element_name(element: Element) -> str:
+    """Return the name of an element in messages: its tag, and its id if it has one."""
+    number = element.get("id", "")
+    return f"{element.tag} {number[:20]}" if number else str(element.tag)
+
+
 def format_value(value: Any) -> str:
     """Format a value as text."""
     if isinstance(value, bool):
@@ -117,8 +123,7 @@ class TextReader:
         """Return a FormatError that names the file and the element."""
         if isinstance(element, str):
             return FormatError(f"{self.location}: {element}: {message}")
-        number = f" {element.get('id', '')[:20]}" if element.get("id") else ""
-        return FormatError(f"{self.location}: {element.tag}{number}: {message}")
+        return FormatError(f"{self.location}: {element_name(element)}: {message}")
 
     def number(self, text: str | None, element: Element, description: str) -> float:
         """A finite number. FormatError if the text is none."""

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from ssad.core.errors import ConfigError, RouteError
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.core.types import F64, Actor, EpisodeLimits, Pose, Scenario, SignalPlan
@@ -35,6 +36,7 @@ KEY_POINT: Final = 25.0  # m between key points of the ego's route
 OFF: Final = 5.0  # m, largest distance of the logged ego from its route: it may be changing lanes
 LEAST_WAY: Final = 10.0  # m, minimum drive of the ego
 MAX_WAY: Final = 1e5  # m that the ego drives
+TOO_FAST: Final = 70.0  # m/s; a faster object is a mistake of the log
 MOVED: Final = 10.0  # m, minimum drive of a vehicle whose path counts as a lane
 CARS: Final = ("car", "suv", "coupe", "compact", "van")
 LARGE: Final = ("truck", "bus", "van")
@@ -62,13 +64,11 @@ class LoggedDrive:
         scenario: The scenario, of type Custom.
         graph: Its town.
         is_known_town: Whether the town can be loaded by its name; else the graph must be stored.
-        omissions: Objects of the log without an actor: category, or reason -> count.
     """
 
     scenario: Scenario
     graph: LaneGraph
     is_known_town: bool
-    omissions: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,13 @@ class _Track:
 
 
 def scenario_of_drive(
-    data: NuScenes, scene: str, *, town: str, map_name: str | None = None, name: str | None = None
+    data: NuScenes,
+    scene: str,
+    *,
+    town: str,
+    map_name: str | None = None,
+    name: str | None = None,
+    report: ImportReport | None = None,
 ) -> LoggedDrive:
     """Build the scenario of a scene.
 
@@ -92,6 +98,7 @@ def scenario_of_drive(
         map_name: Its town, or a file of that town; None: the town that `ssad record` has noted, else lanes
             along the driven paths.
         name: Name of the scenario. None: log/ and the scene's name.
+        report: Filled with what came in, what is not carried over, and what is doubtful.
 
     Returns:
         The scenario with its town.
@@ -102,6 +109,7 @@ def scenario_of_drive(
         MapError: The map cannot be read.
         RouteError: The ego's path does not lie on the roads of the map.
     """
+    account = ImportReport(str(data.root)) if report is None else report
     scene_data = data.scene(scene)
     location = f"{data.root / data.version}: scene '{scene_data.record.name}'"
     start = scene_data.samples[0].timestamp
@@ -114,14 +122,24 @@ def scenario_of_drive(
         raise ConfigError(f"{location}: the ego drives {way / 1000:.3g} km; at most {MAX_WAY / 1000:g} km are imported")
     if way < LEAST_WAY:
         raise ConfigError(f"{location}: the ego drives less than {LEAST_WAY:g} m; choose another scene")
-    tracks, left_out = _tracks(scene_data, start)
+    if _max_speed(ego_poses) > TOO_FAST:
+        account.doubt(f"the ego moves faster than {TOO_FAST:g} m/s")
+    tracks = _tracks(scene_data, start, account)
     if not tracks:
         raise ConfigError(f"{location}: nothing is annotated that could be an actor; choose another scene")
-    tracks, left_out = _nearest_tracks(tracks, ego_poses, left_out)
+    tracks = _nearest_tracks(tracks, ego_poses, account)
     graph, is_known = _town(scene_data, location, path_length, tracks, town=town, map_name=map_name)
     scenario = _scenario(scene_data, graph, path_length, tracks, name or f"log/{scene_data.record.name}", data.version)
     build_episode(scenario, graph, seed=0)
-    return LoggedDrive(scenario, graph, is_known, left_out)
+    account.contents += [
+        f"nuScenes schema {data.version}, scene {scene_data.record.name}: {len(scene_data.samples)} key frames",
+        f"the ego drives {way:.0f} m in {graph.name}; {len(scenario.actors)} actors repeat their motion",
+    ]
+    if not is_known:
+        account.note("the map of the log is not read: lanes follow the paths that were driven")
+    account.note("a log has no states of signals: they are green for the ego and red for all others")
+    account.omit("pictures and point clouds")
+    return LoggedDrive(scenario, graph, is_known)
 
 
 def _is_recorded_by_ssad(scene: SceneData) -> bool:
@@ -141,8 +159,8 @@ def _ego_motion(scene: SceneData, start: int) -> F64:
     return np.array([rows[time] for time in sorted(rows)], np.float64).reshape(-1, 4)
 
 
-def _tracks(scene: SceneData, start: int) -> tuple[list[_Track], Counter[str]]:
-    """Return tracks in the order of their starts, and object counts of the categories without a model."""
+def _tracks(scene: SceneData, start: int, report: ImportReport) -> list[_Track]:
+    """Return tracks in the order of their starts; the report names objects of categories without a model."""
     rows: dict[str, list[tuple[float, float, float, float]]] = {}
     category_and_size: dict[str, tuple[str, F64]] = {}
     for sample in scene.samples:
@@ -156,23 +174,31 @@ def _tracks(scene: SceneData, start: int) -> tuple[list[_Track], Counter[str]]:
             rows.setdefault(instance, []).append((time, x, y, float(yaw[box_index])))
             category_and_size.setdefault(instance, (boxes.category[box_index], boxes.size_lwh[box_index]))
     tracks: list[_Track] = []
-    left_out: Counter[str] = Counter()
     name_counts: Counter[str] = Counter()
     for instance, track_rows in rows.items():
         category, size = category_and_size[instance]
         model = model_of(category, size)
         if model is None:
-            left_out[category] += 1
+            report.omit(f"objects of category {category[:60]}", f"instance {instance[:12]}")
             continue
         short_name = category.rsplit(".", 1)[-1]
         name_counts[short_name] += 1
         table = np.array(track_rows, np.float64)
         # Over a longer gap the motion is unknown, as for the velocities of the official toolkit.
         gap_indices = np.flatnonzero(np.diff(table[:, 0]) > MAX_TIME_DIFF) + 1
+        if len(gap_indices):
+            report.note(
+                f"objects with gaps of more than {MAX_TIME_DIFF:g} s in their annotations become several actors",
+                f"{short_name}-{name_counts[short_name]}",
+            )
         for part_index, part_rows in enumerate(np.split(table, gap_indices)):
             suffix = f"-{part_index + 1}" if part_index else ""
             tracks.append(_Track(f"{short_name}-{name_counts[short_name]}{suffix}", model, part_rows))
-    return tracks, left_out
+            if _max_speed(part_rows) > TOO_FAST:
+                report.doubt(f"an object moves faster than {TOO_FAST:g} m/s", tracks[-1].name)
+            if len(part_rows) == 1:
+                report.note(f"objects annotated in one key frame exist for {STEP:g} s", tracks[-1].name)
+    return tracks
 
 
 def model_of(category: str, size_lwh: F64) -> str | None:
@@ -196,18 +222,21 @@ def _model_size(model: str) -> F64:
     return np.array([body.length, body.width, body.height])
 
 
-def _nearest_tracks(tracks: Sequence[_Track], ego: F64, omissions: Counter[str]) -> tuple[list[_Track], Counter[str]]:
+def _nearest_tracks(tracks: Sequence[_Track], ego: F64, report: ImportReport) -> list[_Track]:
     """Return as many tracks as a scene can hold: those that come nearest to the logged ego."""
     max_tracks = MAX_AGENTS - 1
     if len(tracks) <= max_tracks:
-        return list(tracks), omissions
+        return list(tracks)
     distances = []
     for track in tracks:
         ego_positions = np.stack([np.interp(track.rows[:, 0], ego[:, 0], ego[:, axis]) for axis in (1, 2)], 1)
         distances.append(float(np.hypot(*(track.rows[:, 1:3] - ego_positions).T).min()))
     track_indices = sorted(np.argsort(distances, kind="stable")[:max_tracks].tolist())
-    omissions = omissions + Counter({f"too many (a scene has room for {max_tracks})": len(tracks) - max_tracks})
-    return [tracks[track_index] for track_index in track_indices], omissions
+    for track_index in sorted(set(range(len(tracks))) - set(track_indices)):
+        report.omit(
+            f"objects: a scene has room for {max_tracks}, the nearest to the ego's path", tracks[track_index].name
+        )
+    return [tracks[track_index] for track_index in track_indices]
 
 
 def _town(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -21,13 +20,14 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, RouteError, SSADError
+from ssad.core.import_report import ImportReport
 from ssad.core.safeio import MIB, dump_json, make_folder, read_xml, write_atomic
 from ssad.core.seeding import generator
 from ssad.core.types import Episode, Pose, Scenario
 from ssad.interchange.export import ExportedFiles, episode
 from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
-from ssad.interchange.openscenario_places import AttributeReader
+from ssad.interchange.openscenario_document import AttributeReader
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE
 from ssad.scenarios.dynamic.importer import free_drive
@@ -70,19 +70,22 @@ TYPES_1: Final[Mapping[str, str]] = {
 
 
 def read_leaderboard(
-    path: Path, *, report: Callable[[int, int], None] = lambda completed, total: None
-) -> tuple[tuple[Scenario, ...], tuple[str, ...]]:
+    path: Path,
+    *,
+    report: ImportReport | None = None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
+) -> tuple[Scenario, ...]:
     """Read the scenarios of a file of routes of leaderboard 2.0.
 
     A route without scenarios is a free drive in natural traffic, also one with the waypoints of leaderboard 1.0.
 
     Args:
         path: The file.
-        report: Called after each route with the number of routes that are read, and of all.
+        report: Filled with what came in, what is not carried over, and what is doubtful.
+        progress: Called after each route with the number of routes that are read, and of all.
 
     Returns:
-        One scenario for each scenario element that can be played here and for each route without one, and the
-        features that are not carried over, one line each.
+        One scenario for each scenario element that can be played here and for each route without one.
 
     Raises:
         FormatError: The file is broken, or no scenario in it can be played.
@@ -90,15 +93,17 @@ def read_leaderboard(
     root = read_xml(path, limit=MAX_BYTES)
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
-    values, omissions, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
+    account = ImportReport(str(path)) if report is None else report
+    values, scenarios = AttributeReader(str(path)), list[Scenario]()
     towns = town_names()
     routes = root.findall("route")
     for route_number, route in enumerate(routes):
-        report(route_number, len(routes))
+        progress(route_number, len(routes))
         route_id, town = values.text(route, "id"), values.text(route, "town")
         points = _points(values, route)
+        place = f"route {route_id[:40]}"
         if route.find("weathers/weather") is not None:
-            omissions["weather of a route"] += 1
+            account.omit("weather of a route", place)
         elements = route.findall("scenarios/scenario")
         if not elements:
             try:
@@ -106,7 +111,7 @@ def read_leaderboard(
             except ConfigError as error:
                 raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
             except SSADError as error:
-                omissions[str(error)] += 1
+                _left_out(account, error, town, place)
         for element_index, element in enumerate(elements):
             type_name = values.text(element, "type")
             template = Scenario(
@@ -120,14 +125,14 @@ def read_leaderboard(
             )
             stored = element.find(OWN)
             if stored is None and type_name not in TYPES:
-                omissions[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
+                account.omit(f"type {type_name[:40]}: {UNPLAYED.get(type_name, 'it is not known here')}", place)
                 continue
             if town not in towns:
-                omissions[NO_TOWN.format(town)] += 1
+                account.omit(NO_TOWN.format(town), place)
                 continue
             try:
                 scenario = (
-                    _scenario_of_item(values, element, template, omissions)
+                    _scenario_of_item(values, element, template, account)
                     if stored is None
                     else _restored_scenario(values, element, stored, template)
                 )
@@ -137,16 +142,27 @@ def read_leaderboard(
             except ConfigError as error:
                 raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
             except SSADError as error:
-                omissions[str(error)] += 1
+                _left_out(account, error, town, place)
                 continue
             scenarios.append(scenario)
     if not scenarios:
-        reasons = "; ".join(list(omissions)[:3]) or "it has no route"
+        reasons = "; ".join([*account.omissions, *account.doubts][:3]) or "it has no route"
         raise FormatError(f"{path}: no scenario in it can be played here: {reasons}")
-    report(len(routes), len(routes))
-    return tuple(scenarios), tuple(
-        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in omissions.items()
+    progress(len(routes), len(routes))
+    free_drives = sum(scenario.type == FREE_DRIVE for scenario in scenarios)
+    account.contents.append(
+        f"{len(routes)} routes: {len(scenarios) - free_drives} scenarios, {free_drives} free drives of routes without"
+        " scenarios"
     )
+    return tuple(scenarios)
+
+
+def _left_out(report: ImportReport, error: SSADError, town: str, place: str) -> None:
+    """Note what is left out: its town is not imported, or, which is doubtful, it does not fit the town."""
+    if str(error) == NO_TOWN.format(town):
+        report.omit(str(error), place)
+    else:
+        report.doubt(f"left out: {error}", place)
 
 
 def _free_drive(route_id: str, town: str, points: tuple[Pose, ...], path: Path) -> Scenario:
@@ -182,7 +198,7 @@ def _place(values: AttributeReader, item: Node) -> tuple[float, float]:
     return values.number(item, "x"), 0.0 - values.number(item, "y")
 
 
-def _scenario_of_item(values: AttributeReader, item: Node, base: Scenario, omissions: Counter[str]) -> Scenario:
+def _scenario_of_item(values: AttributeReader, item: Node, base: Scenario, report: ImportReport) -> Scenario:
     """The scenario of an item of a route, with the actors of its type. RouteError: its town does not allow it."""
     type_name = base.group
     add_actors = TYPES[type_name]
@@ -210,7 +226,7 @@ def _scenario_of_item(values: AttributeReader, item: Node, base: Scenario, omiss
     add_actors(site)
     for child in item:
         if child.tag not in site.used_names and child.tag != "trigger_point":
-            omissions[f"{child.tag[:40]} of {type_name}"] += 1
+            report.omit(f"{child.tag[:40]} of {type_name}", base.name)
     return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
 
 

@@ -34,7 +34,7 @@ from ssad.world.roads.query import nearest_all
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from ssad.interchange.openscenario_places import AttributeReader
+    from ssad.interchange.openscenario_document import AttributeReader
 
 SPEED: Final = 8.0  # m/s, assumed speed of the ego where the leaderboard measures seconds to a place
 PICK_UP: Final = 2.5  # m/s^2, assumed acceleration of the ego at the start

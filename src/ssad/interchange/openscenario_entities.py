@@ -1,43 +1,86 @@
-"""Entities of an OpenSCENARIO document, and the models that represent them."""
+"""Entities of an OpenSCENARIO document, and the bodies that represent them."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from ssad.core.types import Phase, Pose
-from ssad.interchange.openscenario_places import AttributeReader
+from ssad.core.types import Body, LateralPhase, Phase, Pose
+from ssad.interchange.openscenario_document import BODIES, AttributeReader
 from ssad.simulators.carla.blueprints import MODEL_OF, nearest_model
 from ssad.world.episode_arrays import MAX_AGENTS
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, model_with_body
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 EGO_NAMES: Final = ("ego", "hero", "ego_vehicle", "egovehicle")
+CLOSE: Final = 1e-6  # within which a body has the size and the limits of its model
 
 
 @dataclass
 class Entity:
-    """An entity of the document, and its behaviour in the storyboard."""
+    """An entity of the document, and its behaviour in the storyboard.
+
+    Attributes:
+        name: Its name.
+        model: Model that represents it.
+        body: Its dimensions and limits, where they differ from those of the model.
+        centre: Centre of the body relative to the reference point, m forward and to the left.
+        ego: The system under test drives it.
+        element: Its element.
+        placed: It has a position at the start.
+        speed: Speed at the start, m/s.
+        policy: Driver that controls it.
+        target_speed: Speed of that driver on a free road, m/s.
+        route: Waypoints.
+        path: Points that it follows.
+        phases: Changes of its speed.
+        lateral: Changes of its lane.
+        rows: Trajectory: time, x, y, yaw.
+        appears: Time at which it appears, s.
+        leaves: Time at which it disappears, s.
+        native: SSAD wrote the file: rates that are the limits of the body mean full power or full brakes.
+    """
 
     name: str
     model: str
-    centre: tuple[float, float]  # of the body, relative to the reference point
+    body: Body
+    centre: tuple[float, float]
     ego: bool
+    element: Element
     placed: bool = True
     speed: float = 0.0
     policy: str = ""
     target_speed: float = 0.0
     route: tuple[Pose, ...] = ()
     path: tuple[Pose, ...] = ()
-    phases: tuple[Phase, ...] = ()
-    event: str = ""  # name of the event that added the last phase
+    phases: list[Phase] = field(default_factory=list)
+    lateral: list[LateralPhase] = field(default_factory=list)
     rows: tuple[tuple[float, float, float, float], ...] = ()
+    appears: float = 0.0
     leaves: float = math.inf
-    change: tuple[float, int, float] | None = None  # m from the start, lanes to the left, m that it takes
+    native: bool = False
+
+    @property
+    def length(self) -> float:
+        """Length of the body, m."""
+        return MODELS[self.model].length if self.body.length is None else self.body.length
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Maximum acceleration and deceleration of an entity that SSAD wrote, m/s^2."""
+        if not self.native:
+            return ()
+        model = model_with_body(MODELS[self.model], self.body)
+        return model.max_accel, model.max_brake
+
+    @property
+    def max_speed(self) -> float:
+        """Maximum speed, m/s."""
+        return MODELS[self.model].max_speed if self.body.max_speed is None else self.body.max_speed
 
 
 def read_entities(
@@ -60,13 +103,20 @@ def read_entities(
         name = values.text(scenario_object, "name")
         if name in entities:
             raise values.error(scenario_object, f"there are two entities '{name}'")
-        body = next((child for child in scenario_object if child.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
+        body = next((child for child in scenario_object if child.tag in BODIES), None)
         if body is None:
+            reference = scenario_object.find("CatalogReference")
+            if reference is not None:
+                raise values.error(
+                    reference,
+                    f"the body of '{name}' is entry '{reference.get('entryName')}' of catalogue "
+                    f"'{reference.get('catalogName')}', which is not there; put it where CatalogLocations says",
+                )
             content = scenario_object[0].tag if len(scenario_object) else "nothing"
             omissions[f"entity '{name}': a {content} instead of its body: it is taken for a car"] += 1
-            entities[name] = Entity(name, "car", (0.0, 0.0), False)
+            entities[name] = Entity(name, "car", Body(), (0.0, 0.0), False, scenario_object)
         else:
-            entities[name] = Entity(name, *_body(name, body, values, omissions, centred), False)
+            entities[name] = _entity(scenario_object, body, values, omissions, centred=centred)
         type_properties = {
             property_element.get("value", "")
             for property_element in scenario_object.iter("Property")
@@ -76,13 +126,10 @@ def read_entities(
             egos.append(name)
     if not entities:
         raise values.error("Entities", "there is no ScenarioObject")
+    vehicles = [name for name, entity in entities.items() if _is_driven(entity)]
+    egos = [name for name in egos if _is_driven(entities[name])]
     if len(egos) > 1:
         omissions[f"of {len(egos)} egos only '{egos[0]}' is driven by the system under test"] += 1
-    vehicles = [
-        entity_name
-        for entity_name, entity in entities.items()
-        if entity.model not in ("walker", "vending_machine", "barrier", "cone")
-    ]
     if not egos and not vehicles:
         raise values.error("Entities", "no vehicle could be the ego")
     if not egos:
@@ -93,10 +140,16 @@ def read_entities(
     return entities
 
 
-def _body(
-    name: str, body: Element, values: AttributeReader, omissions: Counter[str], centred: bool
-) -> tuple[str, tuple[float, float]]:
-    """Return the model that represents a body, and the position of the body's centre."""
+def _is_driven(entity: Entity) -> bool:
+    """Return whether a driver can drive the entity: a vehicle with wheels."""
+    return MODELS[entity.model].wheelbase > 0.0
+
+
+def _entity(
+    scenario_object: Element, body: Element, values: AttributeReader, omissions: Counter[str], *, centred: bool
+) -> Entity:
+    """Return the entity with a body."""
+    name = values.text(scenario_object, "name")
     model_names = [
         property_element.get("value", "")
         for property_element in body.iter("Property")
@@ -109,17 +162,38 @@ def _body(
     size = [values.number(dimensions, key) for key in ("length", "width", "height")]
     offset = (0.0, 0.0) if centred else (values.number(centre, "x"), values.number(centre, "y"))
     if model_names and model_names[0] in MODELS:
-        return model_names[0], offset
-    category = {"Pedestrian": "pedestrian", "MiscObject": "prop"}.get(body.tag)
-    if category is None:
-        category = values.text(body, "vehicleCategory")
-    model = MODEL_OF.get(values.text(body, "name", "")) or nearest_model(category, size)
-    if model is None:
-        raise values.error(body, f"entity '{name}': nobody here is like a {category[:40]}")
-    model_size = (MODELS[model].length, MODELS[model].width, MODELS[model].height)
-    if max(abs(model_extent - extent) for model_extent, extent in zip(model_size, size, strict=True)) > 0.05:
-        omissions[
-            f"the body of '{name}' ({size[0]:g} x {size[1]:g} m) becomes '{model}' "
-            f"({model_size[0]:g} x {model_size[1]:g} m)"
-        ] += 1
-    return model, offset
+        model = model_names[0]
+    else:
+        category = {"Pedestrian": "pedestrian", "MiscObject": "prop"}.get(body.tag)
+        if category is None:
+            category = values.text(body, "vehicleCategory")
+        nearest = MODEL_OF.get(values.text(body, "name", "")) or nearest_model(category, size)
+        if nearest is None:
+            raise values.error(body, f"entity '{name}': nobody here is like a {category[:40]}")
+        model = nearest
+    stated = {"length": size[0], "width": size[1], "height": size[2]}
+    for key, limit in stated.items():
+        if not 0.05 <= limit <= 30.0:
+            omissions[f"the {key} of '{name}' of {limit:g} m: that of a {model} is taken"] += 1
+            stated[key] = getattr(MODELS[model], key)
+    performance = body.find("Performance")
+    if performance is not None and MODELS[model].max_speed > 0.0:
+        for key, attribute, highest in (
+            ("max_speed", "maxSpeed", 100.0),
+            ("max_accel", "maxAcceleration", 20.0),
+            ("max_brake", "maxDeceleration", 20.0),
+        ):
+            # Some files state 200 or 1e10 m/s^2 where they mean no limit.
+            value = values.number(performance, attribute, getattr(MODELS[model], key))
+            stated[key] = min(max(value, 0.1), highest)
+        front, rear = body.find("Axles/FrontAxle"), body.find("Axles/RearAxle")
+        if front is not None and rear is not None and MODELS[model].wheelbase > 0.0:
+            wheelbase = values.number(front, "positionX", 0.0) - values.number(rear, "positionX", 0.0)
+            if 0.2 * stated["length"] <= wheelbase <= stated["length"]:
+                stated["wheelbase"] = wheelbase
+    build_up = next((item for item in body.iter("Property") if item.get("name") == "ssad.brake_build_up"), None)
+    if build_up is not None:
+        stated["brake_build_up"] = values.number(build_up, "value")
+    differing = {key: value for key, value in stated.items() if abs(value - getattr(MODELS[model], key)) > CLOSE}
+    native = bool(model_names) and model_names[0] in MODELS
+    return Entity(name, model, Body(**differing), offset, False, scenario_object, native=native)

@@ -1,76 +1,33 @@
-"""Values and positions of an OpenSCENARIO document: parameters, and every kind of position as a pose in the world."""
+"""Positions of an OpenSCENARIO document as poses in the world, and its routes and trajectories as paths."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.errors import FormatError
+from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType, Pose
+from ssad.interchange.openscenario_document import AttributeReader
+from ssad.interchange.openscenario_maps import RoadCoordinates
+from ssad.interchange.openscenario_trajectories import SampledTrajectory, sample_trajectory
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, move_pose, place_ahead, place_behind, pose_at
+from ssad.world.roads import route_along
 from ssad.world.roads.query import nearest_all
+from ssad.world.roads.xodr import MapRoad
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 LONGEST = 1.0e4  # m along lanes between two entities
-LANES = 20
 NEAR = 2.0  # m outside a lane within which an entity still belongs to it
-_PARAMETER = re.compile(r"^\$\{?\s*(\w+)\s*\}?$")
-
-
-class AttributeReader:
-    """Attributes of elements with the document's parameters substituted; errors name file and element."""
-
-    def __init__(self, location: str, root: Element) -> None:
-        self.location = location
-        self.parameters: dict[str, str] = {
-            item.get("name", ""): item.get("value", "") for item in root.iter("ParameterDeclaration")
-        }
-
-    def error(self, element: Element | str, message: str) -> FormatError:
-        """Return a FormatError that names the file and the element."""
-        tag = element if isinstance(element, str) else element.tag
-        return FormatError(f"{self.location}: {tag}: {message}")
-
-    def text(self, element: Element, name: str, default: str | None = None) -> str:
-        """An attribute as text. FormatError if it is missing and there is no default, or its parameter is unknown."""
-        value = element.get(name, default)
-        if value is None:
-            raise self.error(element, f"attribute '{name}' is missing")
-        reference = _PARAMETER.match(value)
-        if reference is None:
-            if value.startswith("$"):
-                raise self.error(element, f"{name}: expressions are not read, only $parameter: {value[:60]}")
-            return value
-        if reference[1] not in self.parameters:
-            raise self.error(element, f"{name}: parameter ${reference[1]} is not declared")
-        return self.parameters[reference[1]]
-
-    def number(self, element: Element, name: str, default: float | None = None) -> float:
-        """Return an attribute as a finite number. FormatError if it is none."""
-        number_text = self.text(element, name, None if default is None else repr(default))
-        try:
-            value = float(number_text)
-        except ValueError:
-            raise self.error(element, f"{name} is '{number_text[:40]}', not a number") from None
-        if not math.isfinite(value):
-            raise self.error(element, f"{name} is '{number_text[:40]}', not a finite number")
-        return value
-
-    def lanes(self, element: Element, name: str) -> int:
-        """A number of lanes to the left, negative to the right. FormatError where no road has as many."""
-        value = self.number(element, name, 0.0)
-        if abs(value) > LANES:
-            raise self.error(element, f"{name} is {value:g}: no road has so many lanes")
-        return int(value)
+EDGE = 1.0  # m beyond the end of a road that a position may be
+OUTSIDE = 200.0  # m beyond all lanes at which a position is outside the map
 
 
 class PositionReader:
@@ -81,6 +38,8 @@ class PositionReader:
         values: AttributeReader,
         graph: LaneGraph,
         *,
+        town: str,
+        shift: tuple[float, float],
         mirrored: bool,
         omissions: Counter[str],
         starts: Mapping[str, Element],
@@ -90,30 +49,38 @@ class PositionReader:
         Args:
             values: Reads the attributes of elements.
             graph: Lane graph of the town.
+            town: Its name.
+            shift: What is subtracted from world coordinates to get those of the town, m.
             mirrored: World positions are in CARLA's left-handed frame.
             omissions: Counter of the features that are not carried over.
             starts: Name of an entity -> its position at the start.
         """
         self.values, self.graph, self.omissions, self.starts = values, graph, omissions, starts
+        self.roads = RoadCoordinates(town, graph)
+        self._shift = shift
         self._hand = -1.0 if mirrored else 1.0
         self._open: set[str] = set()
+        self._paths: dict[int, SampledTrajectory] = {}
+        self.moved: dict[str, Pose] = {}
         self._kinds: dict[str, Callable[[Element], Pose]] = {
             "WorldPosition": self._world,
             "LanePosition": self._lane,
             "RoadPosition": self._road,
+            "RoutePosition": self._route,
+            "TrajectoryPosition": self._trajectory,
             "RelativeWorldPosition": self._relative,
             "RelativeObjectPosition": self._relative,
             "RelativeLanePosition": self._along,
-            "RelativeRoadPosition": self._along,
+            "RelativeRoadPosition": self._along_road,
         }
 
     def pose(self, position: Element | None, *, within: Element) -> Pose:
-        """Return the pose of a Position. FormatError if it is missing, broken or of an unsupported kind."""
+        """Return the pose of a Position. FormatError if it is missing, broken, unsupported or outside the map."""
         if position is None or not len(position):
             raise self.values.error(within, "Position is missing or empty")
         kind = position[0].tag
         if kind not in self._kinds:
-            raise self.values.error(within, f"a {kind} is not read; known: {', '.join(self._kinds)}")
+            raise self.values.error(position[0], f"a {kind} is not read; known: {', '.join(self._kinds)}")
         return self._kinds[kind](position[0])
 
     def is_supported(self, position: Element | None) -> bool:
@@ -122,6 +89,8 @@ class PositionReader:
 
     def start(self, entity: str, *, within: Element) -> Pose:
         """Return the start pose of an entity. FormatError if it has none, or positions refer to each other."""
+        if entity in self.moved:
+            return self.moved[entity]
         if entity not in self.starts:
             raise self.values.error(within, f"entity '{entity}' has no position at the start")
         if entity in self._open:
@@ -131,6 +100,17 @@ class PositionReader:
             return self.pose(self.starts[entity], within=within)
         finally:
             self._open.discard(entity)
+
+    def check_inside(self, entity: str, pose: Pose, *, within: Element) -> None:
+        """Raise a FormatError if the start of an entity is outside the map."""
+        (x_low, y_low), (x_high, y_high) = self.graph.xy.min(0).tolist(), self.graph.xy.max(0).tolist()
+        is_inside = x_low - OUTSIDE <= pose.x <= x_high + OUTSIDE and y_low - OUTSIDE <= pose.y <= y_high + OUTSIDE
+        if not is_inside:
+            raise self.values.error(
+                within,
+                f"'{entity}' starts at ({pose.x:.6g}, {pose.y:.6g}), outside the map '{self.graph.name}', which has x "
+                f"{x_low:.0f} to {x_high:.0f} and y {y_low:.0f} to {y_high:.0f} m",
+            )
 
     def lane_under(self, pose: Pose, *, aligned: bool = True) -> LanePosition | None:
         """Return the driving lane under a pose; with `aligned`, only one with its direction."""
@@ -148,10 +128,61 @@ class PositionReader:
                 best = max(distance, 0.0), LanePosition(candidate, lane_position)
         return best[1] if best else None
 
+    def trajectory(self, element: Element, entity: str = "") -> SampledTrajectory:
+        """Return a Trajectory, sampled; it may begin where an entity starts.
+
+        Raises:
+            FormatError: It has no shape that is read, or a position is missing.
+        """
+
+        def pose(position: Element | None, within: Element) -> Pose:
+            if position is None and entity:
+                return self.start(entity, within=within)
+            return self.pose(position, within=within)
+
+        if id(element) not in self._paths:
+            self._paths[id(element)] = sample_trajectory(element, self.values, pose)
+        return self._paths[id(element)]
+
+    def route(self, element: Element) -> SampledTrajectory:
+        """Return the way along a Route: on the town's lanes, or straight between waypoints where these do not allow it.
+
+        Raises:
+            FormatError: It has fewer than two waypoints.
+        """
+        if id(element) not in self._paths:
+            poses = self.waypoints(element)
+            if len(poses) < 2:
+                raise self.values.error(element, "a route needs at least two waypoints")
+            try:
+                way = route_along(self.graph, poses)
+                xy, yaw = way.xy.astype(np.float64), way.yaw.astype(np.float64)
+            except RouteError:
+                xy = np.array([(pose.x, pose.y) for pose in poses], np.float64)
+                steps = np.diff(xy, axis=0)
+                yaw = np.arctan2(steps[:, 1], steps[:, 0])
+                yaw = np.append(yaw, yaw[-1])
+            s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+            self._paths[id(element)] = SampledTrajectory(xy, yaw, s, None)
+        return self._paths[id(element)]
+
+    def waypoints(self, route: Element) -> tuple[Pose, ...]:
+        """Return the waypoints of a Route; world positions without a heading face the next one."""
+        elements = route.findall("Waypoint")
+        poses = [self.pose(element.find("Position"), within=element) for element in elements]
+        for index, element in enumerate(elements):
+            world = element.find("Position/WorldPosition")
+            if world is None or world.get("h") is not None or len(poses) < 2:
+                continue
+            start, end = poses[index : index + 2] if index + 1 < len(poses) else poses[index - 1 : index + 1]
+            yaw = math.atan2(end.y - start.y, end.x - start.x)
+            poses[index] = Pose(poses[index].x, poses[index].y, yaw)
+        return tuple(poses)
+
     def _world(self, element: Element) -> Pose:
         x, y, yaw = (self.values.number(element, name, 0.0 if name == "h" else None) for name in ("x", "y", "h"))
         # Adding 0.0 turns a negative zero into zero.
-        return Pose(x, self._hand * y + 0.0, self._hand * yaw + 0.0)
+        return Pose(x - self._shift[0] + 0.0, self._hand * y - self._shift[1] + 0.0, self._hand * yaw + 0.0)
 
     def _apply_orientation(self, element: Element, pose: Pose) -> Pose:
         """Return the pose with an Orientation of the element, relative unless it says absolute."""
@@ -162,45 +193,80 @@ class PositionReader:
         absolute = self.values.text(orientation, "type", "absolute") == "absolute"
         return Pose(pose.x, pose.y, heading if absolute else float(wrap_angle(pose.yaw + heading)))
 
-    def _on_lane(self, element: Element, lane: int, s: float) -> LanePosition:
-        """Return the place at s of a lane by its OpenDRIVE ids; s is measured along the lane itself."""
-        graph = self.graph
+    # ------------------------------------------------------------ road coordinates
+
+    def _find_road(self, element: Element) -> MapRoad | None:
+        """Return the road that an element names; None if the town has no OpenDRIVE."""
+        if self.roads.network is None:
+            return None
+        name = self.values.text(element, "roadId")
+        road = self.roads.road(name)
+        if road is None:
+            raise self.values.error(element, f"town '{self.graph.name}' has no road {name[:40]}")
+        return road
+
+    def _position_along(self, element: Element, road: MapRoad, s: float) -> float:
+        """Return a position on a road, within it. FormatError if it is beyond its end."""
+        if not -EDGE <= s <= road.length + EDGE:
+            name = self.values.text(element, "roadId", str(road.id))
+            raise self.values.error(element, f"s is {s:g} m; road {name} has {road.length:.1f} m")
+        return min(max(s, 0.0), road.length)
+
+    def _lane(self, element: Element) -> Pose:
+        lane_id = int(self.values.number(element, "laneId"))
+        offset = self.values.number(element, "offset", 0.0)
+        road = self._find_road(element)
+        if road is None:
+            return self._lane_without_map(element, lane_id, offset)
+        s = self._position_along(element, road, self.values.number(element, "s"))
+        spot = self.roads.lane(road, lane_id, s)
+        if spot is None:
+            known = ", ".join(map(str, self.roads.lane_ids(road, s)))
+            name = self.values.text(element, "roadId")
+            raise self.values.error(element, f"road {name} has no lane {lane_id} at s {s:g}; it has {known}")
+        x, y, heading = self.roads.at(road, s, spot.t + offset)
+        yaw = heading if spot.forward else float(wrap_angle(heading + math.pi))
+        return self._apply_orientation(element, Pose(x, y, yaw))
+
+    def _lane_without_map(self, element: Element, lane: int, offset: float) -> Pose:
+        """Return the pose on a lane of a town without OpenDRIVE, with s along the lane itself."""
+        graph, s = self.graph, self.values.number(element, "s")
         road = int(self.values.number(element, "roadId"))
         sections = np.flatnonzero((graph.road == road) & (graph.lane_id == lane))
         if not len(sections):
             raise self.values.error(element, f"town '{graph.name}' has no lane {lane} of road {road}")
         sections = sections[np.argsort(graph.section[sections])]
-        road_length = float(graph.length[sections].sum())
-        if not -1.0 <= s <= road_length + 1.0:
-            raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {road} has {road_length:.1f} m")
+        length = float(graph.length[sections].sum())
+        if not -EDGE <= s <= length + EDGE:
+            raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {road} has {length:.1f} m")
         self.omissions["positions by road and s are taken along the lane, not along the road's reference line"] += 1
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:
                 # Traffic of other lanes runs against s.
-                return LanePosition(section, min(max(s if self.graph.forward[section] else length - s, 0.0), length))
+                forward = bool(graph.forward[section])
+                place = LanePosition(section, min(max(s if forward else length - s, 0.0), length))
+                pose = move_pose(pose_at(graph, place), 0.0, offset if forward else -offset)
+                return self._apply_orientation(element, pose)
             s -= length
         raise AssertionError
 
-    def _lane(self, element: Element) -> Pose:
-        lane_id = int(self.values.number(element, "laneId"))
-        place = self._on_lane(element, lane_id, self.values.number(element, "s"))
-        lateral_offset = self.values.number(element, "offset", 0.0) * (1.0 if self.graph.forward[place.lane] else -1.0)
-        return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
-
     def _road(self, element: Element) -> Pose:
         t = self.values.number(element, "t")
-        road_id = int(self.values.number(element, "roadId"))
-        driving_lanes = np.flatnonzero((self.graph.road == road_id) & (self.graph.kind == LaneType.DRIVING))
-        if not len(driving_lanes):
-            raise self.values.error(element, f"town '{self.graph.name}' has no driving lane of road {road_id}")
-        lane_ids = sorted({int(lane_id) for lane_id in self.graph.lane_id[driving_lanes]}, key=abs)
-        nearest_id = next((lane_id for lane_id in lane_ids if lane_id * t > 0.0), lane_ids[0])
-        place = self._on_lane(element, nearest_id, self.values.number(element, "s"))
-        width = self.graph.at(place.lane, place.s)[3]
-        middle = math.copysign((abs(nearest_id) - 0.5) * width, nearest_id)
-        lateral_offset = (t - middle) * (1.0 if self.graph.forward[place.lane] else -1.0)
-        return self._apply_orientation(element, move_pose(pose_at(self.graph, place), 0.0, lateral_offset))
+        road = self._find_road(element)
+        if road is None:
+            raise self.values.error(element, f"town '{self.graph.name}' has no OpenDRIVE, and so no road coordinates")
+        s = self._position_along(element, road, self.values.number(element, "s"))
+        return self._on_road(element, road, s, t)
+
+    def _on_road(self, element: Element, road: MapRoad, s: float, t: float) -> Pose:
+        """Return the pose at s and t: along the traffic there, or as an Orientation states."""
+        x, y, heading = self.roads.at(road, s, t)
+        if element.find("Orientation") is None and not self.roads.forward_at(road, s, t):
+            heading = float(wrap_angle(heading + math.pi))
+        return self._apply_orientation(element, Pose(x, y, heading))
+
+    # ------------------------------------------------------------ relative positions
 
     def _relative(self, element: Element) -> Pose:
         reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
@@ -212,12 +278,31 @@ class PositionReader:
             )
         return self._apply_orientation(element, move_pose(reference_pose, forward, leftward))
 
-    def _along(self, element: Element) -> Pose:
-        reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
-        place = self.lane_under(reference_pose)
+    def _along_road(self, element: Element) -> Pose:
+        """Return the pose ds along and dt across the road of an entity."""
+        reference = self.start(self.values.text(element, "entityRef"), within=element)
+        place = self.lane_under(reference, aligned=False)
         if place is None:
             raise self.values.error(element, "no lane under the entity that it refers to")
-        lateral_offset = self.values.number(element, "dt" if element.tag == "RelativeRoadPosition" else "offset", 0.0)
+        ds, dt = self.values.number(element, "ds"), self.values.number(element, "dt")
+        if abs(ds) > LONGEST:
+            raise self.values.error(element, f"ds is {ds:g} m, beyond {LONGEST:g} m")
+        side = 1.0 if self.graph.forward[place.lane] else -1.0
+        centre = pose_at(self.graph, place)
+        aside = -math.sin(centre.yaw) * (reference.x - centre.x) + math.cos(centre.yaw) * (reference.y - centre.y)
+        ahead = ds * side
+        moved = place_ahead(self.graph, place, ahead) if ahead >= 0.0 else place_behind(self.graph, place, -ahead)
+        pose = move_pose(pose_at(self.graph, moved), 0.0, aside + dt * side)
+        if element.find("Orientation") is None and abs(wrap_angle(pose.yaw - reference.yaw)) > math.pi / 2:
+            pose = Pose(pose.x, pose.y, float(wrap_angle(pose.yaw + math.pi)))
+        return self._apply_orientation(element, pose)
+
+    def _along(self, element: Element) -> Pose:
+        reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
+        place = self.lane_under(reference_pose) or self.lane_under(reference_pose, aligned=False)
+        if place is None:
+            raise self.values.error(element, "no lane under the entity that it refers to")
+        lateral_offset = self.values.number(element, "offset", 0.0)
         distance = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
         lane_count = self.values.lanes(element, "dLane")
         if abs(distance) > LONGEST:
@@ -239,3 +324,72 @@ class PositionReader:
             place = LanePosition(lane, float(nearest[1][match]))
             pose = pose_at(self.graph, place)
         return self._apply_orientation(element, move_pose(pose, 0.0, lateral_offset))
+
+    # ------------------------------------------------------------ on routes and trajectories
+
+    def _route(self, element: Element) -> Pose:
+        route = element.find("RouteRef/Route")
+        place = element.find("InRoutePosition")
+        content = None if place is None else next(iter(place), None)
+        if route is None or content is None:
+            raise self.values.error(element, "RouteRef or InRoutePosition is missing, or its catalogue is not there")
+        way = self.route(route)
+        if content.tag in ("FromCurrentEntity", "PositionOfCurrentEntity"):
+            current = self.start(self.values.text(content, "entityRef"), within=content)
+            nearest = int(np.argmin(np.hypot(way.xy[:, 0] - current.x, way.xy[:, 1] - current.y)))
+            return self._apply_orientation(element, way.at(float(way.s[nearest])))
+        s = self.values.number(content, "pathS")
+        if not -EDGE <= s <= float(way.s[-1]) + EDGE:
+            raise self.values.error(content, f"pathS is {s:g} m; the route has {way.s[-1]:.1f} m")
+        pose = way.at(s)
+        place_on_lane = self.lane_under(pose)
+        if content.tag in ("FromRoadCoordinates", "PositionInRoadCoordinates"):
+            t = self.values.number(content, "t")
+            if place_on_lane is not None:
+                return self._apply_orientation(element, self._beside_reference(pose, place_on_lane, t))
+            return self._apply_orientation(element, move_pose(pose, 0.0, t))
+        lane_id = int(self.values.number(content, "laneId"))
+        offset = self.values.number(content, "laneOffset", 0.0)
+        if place_on_lane is None:
+            return self._apply_orientation(element, move_pose(pose, 0.0, offset))
+        target = self.neighbour(place_on_lane.lane, lane_id)
+        if target is None:
+            raise self.values.error(content, f"the road under the route has no lane {lane_id} at pathS {s:g}")
+        nearest_lanes = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[target])),))
+        match = int(np.flatnonzero(nearest_lanes[0] == target)[0])
+        on_lane = pose_at(self.graph, LanePosition(target, float(nearest_lanes[1][match])))
+        side = 1.0 if self.graph.forward[target] else -1.0
+        moved = move_pose(on_lane, 0.0, offset * side)
+        return self._apply_orientation(element, Pose(moved.x, moved.y, pose.yaw))
+
+    def _beside_reference(self, pose: Pose, place: LanePosition, t: float) -> Pose:
+        """Return the pose of a route, moved to t of the road under it."""
+        road_number, lane_id = int(self.graph.road[place.lane]), int(self.graph.lane_id[place.lane])
+        road = None if self.roads.network is None else self.roads.network.roads.get(road_number)
+        if road is None:
+            return move_pose(pose, 0.0, t)
+        section = road.sections[min(int(self.graph.section[place.lane]), len(road.sections) - 1)]
+        forward = bool(self.graph.forward[place.lane])
+        s = section.s0 + place.s if forward else section.s1 - place.s
+        spot = self.roads.lane(road, lane_id, min(max(s, section.s0), section.s1))
+        if spot is None:
+            return move_pose(pose, 0.0, t)
+        return move_pose(pose, 0.0, (t - spot.t) * (1.0 if forward else -1.0))
+
+    def neighbour(self, lane: int, lane_id: int) -> int | None:
+        """Return the lane with an id in the same section of the road; None if there is none."""
+        graph = self.graph
+        same = np.flatnonzero(
+            (graph.road == graph.road[lane]) & (graph.section == graph.section[lane]) & (graph.lane_id == lane_id)
+        )
+        return int(same[0]) if len(same) else None
+
+    def _trajectory(self, element: Element) -> Pose:
+        trajectory = element.find("TrajectoryRef/Trajectory")
+        if trajectory is None:
+            raise self.values.error(element, "TrajectoryRef is missing, or its catalogue is not there")
+        way = self.trajectory(trajectory)
+        s, t = self.values.number(element, "s"), self.values.number(element, "t", 0.0)
+        if not -EDGE <= s <= float(way.s[-1]) + EDGE:
+            raise self.values.error(element, f"s is {s:g} m; the trajectory has {way.s[-1]:.1f} m")
+        return self._apply_orientation(element, way.at(s, t))

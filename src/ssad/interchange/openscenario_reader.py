@@ -1,8 +1,8 @@
-"""OpenSCENARIO XML 1.0 to 1.3 as a scenario: files of SSAD are restored completely, others as far as they map.
+"""OpenSCENARIO XML 1.0 to 1.3 as scenarios: files of SSAD are restored completely, others as far as they map.
 
-An event that changes a speed becomes a phase, its trigger the phase's condition; a trajectory with times becomes an
-actor's own; one without times, a route, or a lane change becomes its path. The ego is left to the system under test.
-Features without a counterpart are listed in `ImportedScenario.omissions`.
+An event that changes a speed becomes a phase, one that changes a lane a lateral phase, with the event's trigger; a
+trajectory with times becomes an actor's own; one without times, or a route, becomes its path. The ego is left to the
+system under test. Features without a counterpart are listed in `ImportedScenario.omissions`.
 
 CARLA's ScenarioRunner writes world positions in CARLA's left-handed frame, which a description that begins with
 "CARLA:" indicates, and gives positions of bodies' centres (srunner/tools/openscenario_parser.py of ScenarioRunner).
@@ -12,34 +12,39 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ssad.core.errors import FormatError, RouteError
+from ssad.core.errors import FormatError, RouteError, SSADError
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.safeio import MIB, read_xml
-from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Route, Scenario, SignalPlan, SignalState
+from ssad.core.types import F64, Actor, EpisodeLimits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
+from ssad.interchange.openscenario_distributions import parameter_sets, scenario_file
+from ssad.interchange.openscenario_document import AttributeReader, ConstraintError, read_document, resolve
 from ssad.interchange.openscenario_entities import Entity, read_entities
-from ssad.interchange.openscenario_places import AttributeReader, PositionReader
-from ssad.interchange.openscenario_triggers import TriggerReader
+from ssad.interchange.openscenario_maps import DocumentMap, find_map
+from ssad.interchange.openscenario_places import PositionReader
+from ssad.interchange.openscenario_storyboard import StoryboardReader
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.knowledge._placing import lane_path, move_pose
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path, move_pose
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
-from ssad.world.roads import is_town, load_town, route_along, town_signals
+from ssad.world.roads import load_town, route_along, town_signals
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 STEP: Final = 0.1  # s of the world
-MAX_BYTES: Final = 64 * MIB
-WAY: Final = 200.0  # m, length of the path along its lane of an agent without a route
-_CHANGE = 25.0  # m, length of a lane change if the file gives no distance
+WAY: Final = 200.0  # m, shortest path along its lane of an agent without a route
+LONGEST_WAY: Final = 3000.0  # m
+DEFAULT_TIME: Final = 60.0  # s of a scenario that states no time
+FAR_OFF: Final = 5.0  # m from the ego's route of a point that it does not pass
 
 
 @dataclass(frozen=True)
@@ -55,40 +60,101 @@ class ImportedScenario:
     omissions: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class ImportedSet:
+    """Scenarios of a document, or of a distribution of its parameters.
+
+    Attributes:
+        scenarios: The scenarios.
+        report: Account of what came in, what was left out, and what is doubtful.
+    """
+
+    scenarios: tuple[Scenario, ...]
+    report: ImportReport
+
+
 def read_openscenario(path: Path, *, map_name: str | None = None) -> ImportedScenario:
-    """Read the scenario of a file.
+    """Read the scenario of a file; see `read_openscenario_set`.
+
+    Raises:
+        FormatError: The file is broken, is not OpenSCENARIO XML, or holds a distribution of several scenarios.
+        MapError, UnknownNameError: The town does not exist.
+        RouteError: The ego's route does not lie on the town's roads.
+    """
+    imported = read_openscenario_set(path, map_name=map_name)
+    if len(imported.scenarios) != 1:
+        raise FormatError(f"{path}: a distribution of {len(imported.scenarios)} scenarios, not one")
+    omissions = imported.report.omissions
+    lines = (f"{reason}{f' ({len(places)} times)' if len(places) > 1 else ''}" for reason, places in omissions.items())
+    return ImportedScenario(imported.scenarios[0], tuple(lines))
+
+
+def read_openscenario_set(
+    path: Path,
+    *,
+    map_name: str | None = None,
+    assigned: Mapping[str, str] | None = None,
+    count: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ImportedSet:
+    """Read the scenarios of a file: one, or those of a distribution of parameters.
+
+    The map beside the file is imported if no town has it yet.
 
     Args:
         path: The file.
-        map_name: Its town, or a file of that town; None: the town with the name of the file's LogicFile.
+        map_name: Its town, or a file of that town; None: that of the file's LogicFile.
+        assigned: Values of parameters that take the place of the declared ones.
+        count: Draw so many scenarios of a distribution; None: all.
+        progress: Called with the number of scenarios read so far, and of all.
 
     Raises:
         FormatError: The file is broken, or is not OpenSCENARIO XML.
         MapError, UnknownNameError: The town does not exist.
         RouteError: The ego's route does not lie on the town's roads.
     """
-    root = read_xml(path, limit=MAX_BYTES)
-    if root.tag != "OpenSCENARIO":
-        raise FormatError(f"{path}: not OpenSCENARIO XML: its root is <{root.tag[:40]}>")
-    town = map_name
-    if town is None:
-        logic = root.find("RoadNetwork/LogicFile")
-        if logic is None or not logic.get("filepath"):
-            raise FormatError(f"{path}: RoadNetwork: names no LogicFile; say which town it is with --map")
-        map_path = AttributeReader(str(path), root).text(logic, "filepath")
-        town = Path(map_path.replace("\\", "/")).stem
-        if not is_town(town):
-            raise FormatError(
-                f"{path}: its map is '{map_path[:80]}', and there is no town '{town[:80]}'; import the map first "
-                "(ssad import map FILE.xodr), or say which town it is with --map"
-            )
-    return _Reader(str(path), root, load_town(town), town).read(Path(path).stem)
+    root = read_document(path)
+    report = ImportReport(str(path))
+    sets, total = parameter_sets(root, path, count=count)
+    source = scenario_file(root, path) or path
+    document = root if source is path else read_document(source)
+    scenarios: list[Scenario] = []
+    maps: dict[str, DocumentMap] = {}
+    excluded = 0
+    is_set = root.find("ParameterValueDistribution") is not None and total > 1
+    for index, values in enumerate(sets):
+        try:
+            resolved, parameters = resolve(document, source, {**values, **(assigned or {})})
+        except ConstraintError:
+            if not is_set:
+                raise
+            excluded += 1
+            continue
+        logic = resolved.find("RoadNetwork/LogicFile")
+        key = "" if logic is None else logic.get("filepath", "")
+        if key not in maps:
+            maps[key] = find_map(resolved, source, report) if map_name is None else DocumentMap(map_name)
+        reader = _Reader(source, resolved, parameters, maps[key], report)
+        scenario = reader.read(source.stem, f"/{index + 1:04d}" if is_set else "")
+        scenarios.append(scenario)
+        if progress is not None:
+            progress(index + 1, len(sets))
+    if excluded:
+        report.note(f"{excluded} of {len(sets)} sets of values are excluded by constraints of parameters")
+    if not scenarios:
+        raise FormatError(f"{path}: all {len(sets)} sets of values are excluded by constraints of parameters")
+    return ImportedSet(tuple(scenarios), report)
 
 
 class _Reader:
-    def __init__(self, location: str, root: Element, graph: LaneGraph, town: str) -> None:
-        self.root, self.graph, self.town = root, graph, town
-        self.values = AttributeReader(location, root)
+    """Reader of one resolved document."""
+
+    def __init__(
+        self, path: Path, root: Element, parameters: Mapping[str, str], map_: DocumentMap, report: ImportReport
+    ) -> None:
+        self.root, self.town, self.report, self.parameters = root, map_.town, report, parameters
+        self.graph: LaneGraph = load_town(map_.town)
+        self.values = AttributeReader(str(path))
         self.omissions: Counter[str] = Counter()
         header = root.find("FileHeader")
         if header is None:
@@ -101,44 +167,104 @@ class _Reader:
             for property_element in header.iter("Property")
         }
         is_carla = self.description.startswith("CARLA:")
+        self.entities = read_entities(root, self.values, self.omissions, centred=is_carla)
+        self.places = PositionReader(
+            self.values,
+            self.graph,
+            town=map_.town,
+            shift=map_.shift,
+            mirrored=is_carla,
+            omissions=self.omissions,
+            starts=self._starts(),
+        )
+        self.ego = next(entity for entity in self.entities.values() if entity.ego)
+
+    def _starts(self) -> dict[str, Element]:
+        """Return the position at the start of each entity that has one."""
         starts: dict[str, Element] = {}
-        for private in root.iterfind("Storyboard/Init/Actions/Private"):
+        for private in self.root.iterfind("Storyboard/Init/Actions/Private"):
             position = private.find("PrivateAction/TeleportAction/Position")
             if position is not None:
                 starts[private.get("entityRef", "")] = position
-        for action in root.iter("EntityAction"):
+        for action in self.root.iter("EntityAction"):
             position = action.find("AddEntityAction/Position")
             if position is not None:
                 starts.setdefault(action.get("entityRef", ""), position)
-        self.places = PositionReader(self.values, graph, mirrored=is_carla, omissions=self.omissions, starts=starts)
-        self.entities = read_entities(root, self.values, self.omissions, centred=is_carla)
-        for entity in self.entities.values():
-            entity.placed = entity.name in starts
+        return starts
+
+    def _place(self) -> None:
+        """Find the start of each entity: its position, or that of the trajectory that it begins with."""
+        storyboard = StoryboardReader(
+            self.root,
+            self.places,
+            self.entities,
+            parameters=self.parameters,
+            omissions=self.omissions,
+            report=self.report,
+        )
+        self.storyboard = storyboard
+        for private in self.root.iterfind("Storyboard/Init/Actions/Private"):
+            name = private.get("entityRef", "")
+            follow = private.find("PrivateAction/RoutingAction/FollowTrajectoryAction")
+            if follow is None or name in self.places.starts or name not in self.entities:
+                continue
+            way = storyboard.find_trajectory(follow, replace(self.entities[name], placed=False))
+            if way is not None:
+                self.places.moved[name] = way.at(0.0)
+        for entity in sorted(self.entities.values(), key=lambda entity: not entity.ego):
+            entity.placed = entity.name in self.places.starts or entity.name in self.places.moved
             if not entity.placed and not entity.ego:
                 self.omissions[f"'{entity.name}': it has no position at the start"] += 1
-        self.triggers = TriggerReader(self.places, self.entities, self.omissions)
-        self.ego = self.triggers.ego
+            if entity.placed:
+                pose = self.places.start(entity.name, within=entity.element)
+                element = self.places.starts.get(entity.name, entity.element)
+                self.places.check_inside(entity.name, pose, within=element)
+            if entity.ego and entity.placed and not self._has_way(entity):
+                self._start_lane(pose)
 
-    # ------------------------------------------------------------ the document
+    def _has_way(self, entity: Entity) -> bool:
+        """Return whether an action at the start gives an entity a route or a trajectory."""
+        privates = self.root.iterfind("Storyboard/Init/Actions/Private")
+        return any(
+            private.get("entityRef") == entity.name and private.find("PrivateAction/RoutingAction") is not None
+            for private in privates
+        )
 
-    def read(self, stem: str) -> ImportedScenario:
-        """Return the scenario, checked, and the features that are not carried over."""
-        forced_signals = self._start()
-        for maneuvers in self.root.iterfind("Storyboard/Story/Act/ManeuverGroup"):
-            self._group(maneuvers)
-        # After the events: the phase of an act's trigger goes before all others.
-        for act in self.root.iterfind("Storyboard/Story/Act"):
-            self._act_trigger(act)
+    def _start_lane(self, start: Pose) -> LanePosition:
+        """Return the lane on which the ego starts. RouteError if there is none."""
+        place = self.places.lane_under(start)
+        if place is None:
+            source, line = getattr(self.ego.element, "source", ""), getattr(self.ego.element, "line", 0)
+            raise RouteError(
+                f"{source}:{line}: the ego '{self.ego.name}' does not stand on a road of '{self.town}' in the direction"
+                " of its traffic"
+            )
+        return place
+
+    def read(self, stem: str, suffix: str) -> Scenario:
+        """Return the scenario, checked."""
+        self._place()
+        # As conditions count, only agents that are placed become actors.
+        self.storyboard = StoryboardReader(
+            self.root,
+            self.places,
+            self.entities,
+            parameters=self.parameters,
+            omissions=self.omissions,
+            report=self.report,
+        )
+        forced_signals = self._signals()
+        self.storyboard.read()
         limits = self._limits()
         if self.own_properties.get("contact") in ("end", "count", "remove"):
             limits = replace(limits, contact=self.own_properties["contact"])  # type: ignore[arg-type]
-        key_points = self._ego_route()
-        ego_route = route_along(self.graph, key_points)
-        start_pose = self._centre(self.ego, self.places.start(self.ego.name, within=self.root))
-        name = scenario_name(self.description.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
         speed = self.ego.target_speed or self.ego.speed or Scenario.target_speed
+        key_points = self._ego_route(limits)
+        ego_route = route_along(self.graph, key_points)
+        start_pose = self._centre(self.ego, self.places.start(self.ego.name, within=self.ego.element))
+        name = scenario_name(self.description.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
         scenario = Scenario(
-            name=name,
+            name=name[: 120 - len(suffix)] + suffix,
             type="Custom",
             town=self.town,
             route=key_points,
@@ -147,322 +273,228 @@ class _Reader:
             target_speed=min(speed, MAX_SPEED),
             group=self.own_properties.get("group", ""),
             source=f"OpenSCENARIO {Path(self.values.location).name}",
+            ego_model=self.ego.model,
+            ego_body=self.ego.body,
+            friction=self._friction(),
         )
+        for entity in self.entities.values():
+            entity.phases = self._with_meetings(entity, ego_route)
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
-        build_episode(scenario, self.graph, seed=0)  # reports any remaining error of the scenario
-        return ImportedScenario(
-            scenario,
-            tuple(f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in self.omissions.items()),
-        )
+        try:
+            build_episode(scenario, self.graph, seed=0)
+        except SSADError as error:
+            raise type(error)(f"{self.values.location}: {error}") from None
+        for message, times in self.omissions.items():
+            self.report.omissions.setdefault(message, []).extend([""] * times)
+        return scenario
 
     def _centre(self, entity: Entity, pose: Pose) -> Pose:
         return move_pose(pose, *entity.centre) if any(entity.centre) else pose
 
     # ------------------------------------------------------------ the start
 
-    def _start(self) -> dict[str, str]:
-        """Read Init; return the states of signals by id, and by number for those that are not in the map."""
+    def _signals(self) -> dict[str, str]:
+        """Return the states of signals at the start by id, and by number for those that are not in the map."""
         assignments = (element.partition("=") for element in self.own_properties.get("signals", "").split())
         forced_signals = {f"ssad:{signal}": state for signal, _, state in assignments}
         for action in self.root.iterfind("Storyboard/Init/Actions/GlobalAction"):
             element = action.find("InfrastructureAction/TrafficSignalAction/TrafficSignalStateAction")
             if element is not None:
                 forced_signals[self.values.text(element, "name")] = self.values.text(element, "state")
-            else:
-                self._record_omission("at the start", action)
-        for agent_actions in self.root.iterfind("Storyboard/Init/Actions/Private"):
-            entity = self.triggers.referenced_entity(agent_actions)
-            for action in agent_actions:
-                element = action[0] if len(action) else action
-                if element.tag == "ControllerAction":
-                    self._driver(entity, element)
-                elif element.tag == "RoutingAction":
-                    self._routing(entity, element, 0.0)
-                elif element.find("SpeedAction") is not None:
-                    entity.speed = self._speed(entity, element)
-                elif element.tag != "TeleportAction":
-                    self._record_omission(f"at the start of '{entity.name}'", action)
+            elif (entity_action := action.find("EntityAction")) is not None:
+                if entity_action.find("DeleteEntityAction") is not None:
+                    self.storyboard.triggers.referenced_entity(entity_action).leaves = 0.0
+            elif action.find(".//RoadCondition") is None or len(list(action.iter())) > 8:
+                self.storyboard.record_omission("at the start", action)
+        for action in self.root.iterfind("Storyboard/Init/Actions/UserDefinedAction"):
+            self.storyboard.record_omission("at the start", action)
         return forced_signals
 
-    def _driver(self, entity: Entity, action: Element) -> None:
-        for controller in action.iter("Controller"):
-            properties = {
-                property_element.get("name", ""): property_element for property_element in controller.iter("Property")
-            }
-            if "target_speed" in properties:
-                entity.target_speed = self.values.number(properties["target_speed"], "value")
-            name = self.values.text(controller, "name", "")
-            if not entity.ego:
-                if name in ("autopilot", "blind") and "target_speed" in properties:
-                    entity.policy = name
-                else:
-                    self.omissions[f"controller '{name}' of '{entity.name}'"] += 1
-        if action.find(".//CatalogReference") is not None:
-            self.omissions[f"controller of '{entity.name}' in a catalogue"] += 1
-
-    def _record_omission(self, context: str, action: Element) -> None:
-        """Name an action that has no counterpart: the innermost element whose name says what it does."""
-        action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
-        self.omissions[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
-
-    def _speed(self, entity: Entity, action: Element) -> float:
-        target = action.find("SpeedAction/SpeedActionTarget/AbsoluteTargetSpeed")
-        if target is not None:
-            speed = self.values.number(target, "value")
-        else:
-            relative = action.find("SpeedAction/SpeedActionTarget/RelativeTargetSpeed")
-            if relative is None:
-                raise self.values.error("SpeedAction", "SpeedActionTarget is missing")
-            other, value = self.triggers.referenced_entity(relative), self.values.number(relative, "value")
-            is_delta = self.values.text(relative, "speedTargetValueType") == "delta"
-            speed = other.speed + value if is_delta else other.speed * value
-            self.omissions[f"a speed of '{entity.name}' that depends on '{other.name}' is fixed at {speed:g} m/s"] += 1
-        max_speed = MODELS[entity.model].max_speed
-        if not 0.0 <= speed <= max_speed and not entity.ego:
-            self.omissions[
-                f"a speed of '{entity.name}' of {speed:g} m/s: a {entity.model} has 0 to {max_speed:g} m/s"
-            ] += 1
-            speed = min(max(speed, 0.0), max_speed)
-        dynamics = action.find("SpeedAction/SpeedActionDynamics")
-        if dynamics is not None and self.values.text(dynamics, "dynamicsShape") != "step":
-            model = MODELS[entity.model]
-            rate = self.values.number(dynamics, "value")
-            is_rate = self.values.text(dynamics, "dynamicsDimension") == "rate"
-            if not is_rate or min(abs(rate - model.max_accel), abs(rate - model.max_brake)) > 1e-6:
-                self.omissions["how fast speeds change: vehicles use full throttle or full brake"] += 1
-        return speed
-
-    def _routing(self, entity: Entity, action: Element, begins: float | None) -> None:
-        inner = action[0] if len(action) else action
-        if inner.tag == "AcquirePositionAction":
-            position = inner.find("Position")
-            if self.places.is_supported(position):
-                entity.route = (self.places.pose(position, within=inner),)
-                return
-        elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
-            points = [waypoint.find("Position") for waypoint in inner.iterfind("Route/Waypoint")]
-            if all(self.places.is_supported(point) for point in points):
-                entity.route = _with_headings(points, tuple(self.places.pose(point, within=inner) for point in points))
-                return
-        elif inner.tag == "FollowTrajectoryAction" and not entity.ego:
-            self._trajectory(entity, inner, begins)
-            return
-        self._record_omission(f"of '{entity.name}'", action)
-
-    def _trajectory(self, entity: Entity, action: Element, begins: float | None) -> None:
-        vertices = action.findall(".//Shape/Polyline/Vertex")
-        points = [vertex.find("Position") for vertex in vertices]
-        if len(vertices) < 2 or not all(self.places.is_supported(point) for point in points):
-            self.omissions[f"a trajectory of '{entity.name}' that is no polyline of places that are read"] += 1
-            return
-        read_poses = tuple(self.places.pose(point, within=action) for point in points)
-        poses = tuple(self._centre(entity, pose) for pose in _with_headings(points, read_poses))
-        timing = action.find("TimeReference/Timing")
-        if timing is None:
-            entity.path = poses
-            return
-        scale, offset = (
-            self.values.number(timing, attribute, default) for attribute, default in (("scale", 1.0), ("offset", 0.0))
-        )
-        if self.values.text(timing, "domainAbsoluteRelative") == "relative":
-            if begins is None:
-                self.omissions[f"the trigger of the trajectory of '{entity.name}': it begins with the episode"] += 1
-            offset += begins or 0.0
-        times = [self.values.number(vertex, "time") * scale + offset for vertex in vertices]
-        entity.rows = tuple((time, point.x, point.y, point.yaw) for time, point in zip(times, poses, strict=True))
-
-    # ------------------------------------------------------------ events
-
-    def _group(self, group: Element) -> None:
-        references = group.findall("Actors/EntityRef")
-        actors = [self.triggers.referenced_entity(reference) for reference in references]
-        events = group.findall("Maneuver/Event")
-        if group.find("CatalogReference") is not None:
-            self.omissions["a maneuver in a catalogue"] += 1
-        for event in events:
-            label = self.values.text(event, "name", "")
-            for action in event.iterfind("Action"):
-                inner = action[0] if len(action) else action
-                if inner.tag == "GlobalAction":
-                    self._global(inner, event, label)
-                    continue
-                for entity in actors:
-                    self._act(entity, inner, event, label)
-
-    def _global(self, action: Element, event: Element, label: str) -> None:
-        entity_action = action.find("EntityAction")
-        if entity_action is None:
-            self._record_omission(f"in event '{label}'", action)
-            return
-        entity = self.triggers.referenced_entity(entity_action)
-        condition = self._start_condition(event, entity, label)
-        if entity_action.find("AddEntityAction") is not None:
-            if not entity.rows and (condition is None or condition.kind != "always"):
-                self.omissions[f"'{entity.name}' is there from the start, not from event '{label}' on"] += 1
-        elif condition is not None and condition.kind == "time":
-            entity.leaves = condition.value
-        else:
-            self.omissions[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
-
-    def _act(self, entity: Entity, action: Element, event: Element, label: str) -> None:
-        inner = action[0] if len(action) else action
-        if entity.ego:
-            self.omissions[f"event '{label}' of the ego: the system under test drives it"] += 1
-            return
-        if inner.find("SpeedAction") is not None:
-            conditions = self.triggers.conditions(event, entity, label)
-            if conditions is None and entity.phases:
-                self.omissions[f"event '{label}': when it begins is not known"] += 1
-                return
-            *waiting_conditions, final_condition = conditions or (PhaseTrigger("always"),)
-            previous_speed = (
-                entity.phases[-1].speed if entity.phases else min(entity.speed, MODELS[entity.model].max_speed)
-            )
-            # A phase has one condition; a sequence of them needs phases that keep the speed.
-            waiting_phases = (Phase(previous_speed, wait) for wait in waiting_conditions)
-            entity.phases = (*entity.phases, *waiting_phases, Phase(self._speed(entity, inner), final_condition))
-            entity.event = label
-        elif inner.tag == "RoutingAction":
-            condition = self._start_condition(event, entity, label)
-            start_times = {"always": 0.0, "time": condition.value if condition else 0.0}
-            start_time = start_times.get(condition.kind) if condition else None
-            if start_time is None and inner.find("FollowTrajectoryAction//Timing") is None:
-                self.omissions[f"the trigger of event '{label}': '{entity.name}' keeps that path from the start"] += 1
-            self._routing(entity, inner, start_time)
-        elif inner.find("LaneChangeAction") is not None:
-            self._lane_change(entity, inner, self._start_condition(event, entity, label), label)
-        else:
-            self._record_omission(f"in event '{label}'", action)
-
-    def _start_condition(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
-        """Return the single condition of a trigger; None also if it is a sequence."""
-        conditions = self.triggers.conditions(event, entity, label)
-        return conditions[0] if conditions is not None and len(conditions) == 1 else None
-
-    def _lane_change(self, entity: Entity, action: Element, start_condition: PhaseTrigger | None, label: str) -> None:
-        """A lane change whose place is known becomes part of the path; else it is lost."""
-        target = action.find("LaneChangeAction/LaneChangeTarget/RelativeTargetLane")
-        speed = entity.phases[-1].speed if entity.phases else entity.speed
-        start_distance = (
-            {"always": 0.0, "travelled": start_condition.value, "time": start_condition.value * speed}.get(
-                start_condition.kind
-            )
-            if start_condition
-            else None
-        )
-        if target is None or start_distance is None or entity.change is not None:
-            self.omissions[f"LaneChangeAction in event '{label}': it is not known where it begins"] += 1
-            return
-        dynamics = action.find("LaneChangeAction/LaneChangeActionDynamics")
-        length = _CHANGE
-        if dynamics is not None and self.values.text(dynamics, "dynamicsDimension") in ("distance", "time"):
-            value = self.values.number(dynamics, "value")
-            length = value if self.values.text(dynamics, "dynamicsDimension") == "distance" else value * speed
-        entity.change = start_distance, self.values.lanes(target, "value"), max(length, 5.0)
-
-    def _act_trigger(self, act: Element) -> None:
-        """Convert the trigger of an act: its actors wait for it in a phase before all others."""
-        for group in act.iterfind("ManeuverGroup"):
-            for reference in group.iterfind("Actors/EntityRef"):
-                entity = self.triggers.referenced_entity(reference)
-                conditions = self.triggers.conditions(act, entity, self.values.text(act, "name", "act")) or ()
-                waiting_phases = (
-                    Phase(min(entity.speed, 60.0), condition)
-                    for condition in conditions
-                    if condition != PhaseTrigger("always")
-                )
-                entity.phases = (*waiting_phases, *entity.phases)
+    def _friction(self) -> float:
+        """Return the friction of the road: 0.9 times the scale that an environment at the start states."""
+        friction = Scenario.friction
+        for action in self.root.iterfind("Storyboard/Init/Actions/GlobalAction/EnvironmentAction"):
+            condition = action.find(".//RoadCondition")
+            if condition is not None and condition.get("frictionScaleFactor") is not None:
+                scale = self.values.number(condition, "frictionScaleFactor")
+                friction = min(max(Scenario.friction * scale, 0.05), 1.5)
+        return friction
 
     # ------------------------------------------------------------ parts of the scenario
 
     def _limits(self) -> EpisodeLimits:
         limits = EpisodeLimits()
-        trigger = self.root.find("Storyboard/StopTrigger")
-        conditions = [] if trigger is None else trigger.findall("ConditionGroup/Condition")
+        groups = self.root.findall("Storyboard/StopTrigger/ConditionGroup")
+        conditions = [condition for group in groups for condition in group]
+        # A condition that must hold together with others says nothing of its own.
+        alone = [group[0] for group in groups if len(group) == 1]
         times: list[float] = []
         for condition in conditions:
             name = condition.get("name", "")
             time_condition = condition.find("ByValueCondition/SimulationTimeCondition")
             distance_condition = condition.find("ByEntityCondition/EntityCondition/TraveledDistanceCondition")
-            if time_condition is not None:
-                value = self.values.number(time_condition, "value")
+            if time_condition is not None and condition in alone:
+                value = self.values.number(time_condition, "value") + self.values.number(condition, "delay", 0.0)
                 if name == "max_steps":
                     limits = replace(limits, max_steps=round(value / STEP))
                 elif name == "max_time":
                     limits = replace(limits, max_time=value)
                 else:
                     times.append(value)
-            elif distance_condition is not None:
-                limits = replace(limits, max_distance=self.values.number(distance_condition, "value"))
+            elif distance_condition is not None and condition in alone:
+                limits = replace(limits, max_distance=max(self.values.number(distance_condition, "value"), 1.0))
             elif name != "end of the route" and condition.find(".//CollisionCondition") is None:
                 condition_tags = [element.tag for element in condition.iter() if element.tag.endswith("Condition")]
-                self.omissions[f"{condition_tags[-1]} of the stop trigger"] += 1
+                self.omissions[f"{condition_tags[-1] if condition_tags else 'a condition'} of the stop trigger"] += 1
         if times:
-            limits = replace(limits, max_time=min(times), max_steps=math.ceil(min(times) / STEP))
+            time = max(min(times), STEP)
+            limits = replace(limits, max_time=time, max_steps=math.ceil(time / STEP))
+        elif not any(condition.get("name") == "max_steps" for condition in conditions):
+            limits = replace(limits, max_steps=round(DEFAULT_TIME / STEP))
         return limits
 
-    def _ego_route(self) -> tuple[Pose, ...]:
-        start = self.places.start(self.ego.name, within=self.root)
+    def _way(self, speed: float, limits: EpisodeLimits) -> float:
+        """Return the length of the path of an agent without a route, m."""
+        time = min(limits.max_steps * STEP, limits.max_time)
+        return min(max(1.1 * speed * time, WAY), LONGEST_WAY)
+
+    def _ego_route(self, limits: EpisodeLimits) -> tuple[Pose, ...]:
+        if not self.ego.placed:
+            raise self.values.error(self.ego.element, f"entity '{self.ego.name}' has no position at the start")
+        start = self.places.start(self.ego.name, within=self.ego.element)
         points = self.ego.route
+        if not points and self.ego.path:
+            first, trajectory = self.ego.path[0], self.ego.path
+            begins_here = math.dist((first.x, first.y), (start.x, start.y)) < FAR_OFF
+            points = self._along_trajectory(trajectory if begins_here else (start, *trajectory))
         if len(points) > 1:
             return points
-        start_lane = self.places.lane_under(start)
-        if start_lane is None:
-            raise RouteError(
-                f"{self.values.location}: the ego '{self.ego.name}' does not stand on a road of '{self.town}'"
-            )
+        start_lane = self._start_lane(start)
         if points:
             return (start, *points)
-        self.omissions[f"the ego has no route: {WAY:g} m along its lane"] += 1
-        path = lane_path(self.graph, start_lane, WAY)
+        way = self._way(max(self.ego.speed, self.ego.target_speed), limits)
+        self.report.note("the ego has no route: it follows its lane", f"{way:.0f} m")
+        path = lane_path(self.graph, start_lane, way)
         if len(path) < 3:
             raise RouteError(f"{self.values.location}: the road ends before the ego '{self.ego.name}'")
-        key_points = path[np.unique(np.linspace(0, len(path) - 2, 9).astype(int))]
-        next_points = path[np.unique(np.linspace(0, len(path) - 2, 9).astype(int)) + 1]
-        headings = np.arctan2(*(next_points - key_points).T[::-1])
+        count = max(9, int(len(path) * 9 / WAY))
+        indices = np.unique(np.linspace(0, len(path) - 2, count).astype(int))
+        key_points = path[indices]
+        headings = np.arctan2(*(path[indices + 1] - key_points).T[::-1])
         return tuple(
             Pose(x, y, heading) for (x, y), heading in zip(key_points.tolist(), headings.tolist(), strict=True)
         )
 
+    def _along_trajectory(self, path: tuple[Pose, ...]) -> tuple[Pose, ...]:
+        """Return key points of a route along the trajectory of the ego; () if the lanes do not allow it."""
+        for count in (9, 5, 3, 2):
+            indices = np.unique(np.linspace(0, len(path) - 1, count).astype(int))
+            points = tuple(path[index] for index in indices.tolist())
+            try:
+                route = route_along(self.graph, points)
+            except RouteError:
+                continue
+            if route.length < 1.5 * _length(path) + 20.0:
+                return points
+        self.omissions[f"the trajectory of the ego '{self.ego.name}', which the town's lanes do not allow"] += 1
+        return ()
+
+    def _with_meetings(self, entity: Entity, route: Route) -> list[Phase]:
+        """Return the phases of an entity without meetings at points that the ego's route does not pass."""
+        line = route.xy.astype(np.float64)
+        phases = []
+        for phase in entity.phases:
+            arrival, kept = phase.arrival, phase
+            is_of_ego = arrival is not None and arrival.reference == "ego"
+            if arrival is not None and is_of_ego and _distance(line, arrival.reference_point) > FAR_OFF:
+                self.omissions[f"'{entity.name}' meets the ego at a point that its route does not pass"] += 1
+                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(kept)
+        return phases
+
     def _actors(self, limits: EpisodeLimits) -> list[Actor]:
         end_time = min(limits.max_steps * STEP, limits.max_time)
-        return [self._actor(entity, end_time) for entity in self.entities.values() if entity.placed and not entity.ego]
+        actors = [entity for entity in self.entities.values() if entity.placed and not entity.ego]
+        actors = [entity for entity in actors if entity.leaves > 0.0]
+        return [replace(self._actor(entity, end_time, limits), body=entity.body) for entity in actors]
 
-    def _actor(self, entity: Entity, until: float) -> Actor:
+    def _actor(self, entity: Entity, until: float, limits: EpisodeLimits) -> Actor:
+        pose = self._centre(entity, self.places.start(entity.name, within=entity.element))
         if entity.rows:
-            rows = list(entity.rows)
-            if rows[-1][0] < min(until, entity.leaves):
-                rows.append((until + 1.0, *rows[-1][1:]))  # it stays at the end of its trajectory
-            if entity.phases:
-                self.omissions[f"speeds of '{entity.name}': its trajectory has times"] += 1
-            return Actor(entity.name, entity.model, Pose(*rows[0][1:]), trajectory=tuple(rows))
+            return self._on_trajectory(entity, pose, until)
+        moves = bool(entity.speed or entity.phases or entity.lateral or entity.policy)
+        if not moves and (entity.appears > 0.0 or math.isfinite(entity.leaves)):
+            entity.rows = ((entity.appears, pose.x, pose.y, pose.yaw), (until + 1.0, pose.x, pose.y, pose.yaw))
+            return self._on_trajectory(entity, pose, until)
         if math.isfinite(entity.leaves):
             self.omissions[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
-        pose = self._centre(entity, self.places.start(entity.name, within=self.root))
+        if entity.appears > 0.0:
+            self.omissions[f"AddEntityAction of '{entity.name}': it is there from the start"] += 1
         model = MODELS[entity.model]
         if model.max_speed == 0.0:
-            if entity.phases or entity.path:
+            if moves or entity.path:
                 self.omissions[f"what '{entity.name}' does: a {entity.model} stands still"] += 1
             return Actor(entity.name, entity.model, pose)
         if entity.policy:
             path = tuple((point.x, point.y) for point in entity.route) if len(entity.route) > 1 else ()
-            speed = min(max(entity.target_speed, 0.1), model.max_speed)
+            speed = min(max(entity.target_speed, 0.1), entity.max_speed)
             return Actor(entity.name, entity.model, pose, path=path, policy=entity.policy, target_speed=speed)
-        phases = entity.phases
-        if entity.speed > 0.0:
-            phases = (Phase(min(entity.speed, model.max_speed)), *phases)
-            self.omissions[f"'{entity.name}' starts from rest, and then goes for {entity.speed:g} m/s"] += 1
-        return Actor(entity.name, entity.model, pose, phases=phases, path=self._path(entity, pose) if phases else ())
+        path = self._path(entity, pose, limits) if moves else ()
+        return Actor(
+            entity.name,
+            entity.model,
+            pose,
+            phases=self._with_own_meetings(entity, pose, path),
+            lateral=tuple(entity.lateral),
+            path=path,
+            speed=min(entity.speed, entity.max_speed),
+        )
 
-    def _path(self, entity: Entity, pose: Pose) -> tuple[tuple[float, float], ...]:
+    def _with_own_meetings(
+        self, entity: Entity, pose: Pose, path: tuple[tuple[float, float], ...]
+    ) -> tuple[Phase, ...]:
+        """Return the phases of an entity without meetings at points that its own path does not pass."""
+        ahead = move_pose(pose, LONGEST_WAY, 0.0)
+        line = np.array(path if len(path) > 1 else ((pose.x, pose.y), (ahead.x, ahead.y)))
+        phases = []
+        for phase in entity.phases:
+            kept = phase
+            if phase.arrival is not None and _distance(line, phase.arrival.point) > FAR_OFF:
+                self.omissions[f"'{entity.name}' meets another at a point that its path does not pass"] += 1
+                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(kept)
+        return tuple(phases)
+
+    def _on_trajectory(self, entity: Entity, pose: Pose, until: float) -> Actor:
+        """Return an actor that follows the trajectory of an entity."""
+        rows = [row for row in entity.rows if entity.appears - 1e-9 <= row[0] <= entity.leaves] or list(entity.rows)
+        if rows[0][0] > 0.0 and entity.appears == 0.0 and entity.name in self.places.starts:
+            rows.insert(0, (0.0, pose.x, pose.y, pose.yaw))  # it waits where it was placed, or drives from there
+        if math.isfinite(entity.leaves) and rows[-1][0] < entity.leaves < until:
+            rows.append((entity.leaves, *rows[-1][1:]))
+        elif rows[-1][0] < min(until, entity.leaves):
+            rows.append((until + 1.0, *rows[-1][1:]))  # it stays at the end of its trajectory
+        if entity.phases or entity.lateral:
+            self.omissions[f"speeds and lanes of '{entity.name}': its trajectory has times"] += 1
+        rows = [row for index, row in enumerate(rows) if index == 0 or row[0] > rows[index - 1][0]]
+        if len(rows) < 2:
+            rows.append((rows[0][0] + STEP, *rows[0][1:]))
+        return Actor(entity.name, entity.model, Pose(*rows[0][1:]), trajectory=tuple(rows))
+
+    def _path(self, entity: Entity, pose: Pose, limits: EpisodeLimits) -> tuple[tuple[float, float], ...]:
         """Return the path of an actor: from the file, else its lane; () is straight on."""
         if entity.path:
-            return () if _is_straight(entity.path) else tuple((point.x, point.y) for point in entity.path)
-        if entity.model == "walker":
-            points = (pose, *entity.route) if len(entity.route) == 1 else entity.route
+            if _is_straight(entity.path) and not entity.lateral:
+                return ()
+            points = list(entity.path)
+            if math.dist((pose.x, pose.y), (points[0].x, points[0].y)) > 1.0:
+                points.insert(0, pose)
+            return tuple((point.x, point.y) for point in points)
+        if entity.model == "walker" or MODELS[entity.model].wheelbase == 0.0:
+            points = [pose, *entity.route] if len(entity.route) == 1 else list(entity.route)
             return tuple((point.x, point.y) for point in points)
         if entity.route:
-            points = (pose, *entity.route) if len(entity.route) == 1 else entity.route
+            points = [pose, *entity.route] if len(entity.route) == 1 else list(entity.route)
             try:
                 return tuple((x, y) for x, y in route_along(self.graph, points).xy.tolist())
             except RouteError:
@@ -470,7 +502,10 @@ class _Reader:
         place = self.places.lane_under(pose)
         if place is None:
             return ()
-        lane_points = lane_path(self.graph, place, WAY)
+        fastest = max([entity.speed, *(phase.speed or 0.0 for phase in entity.phases)])
+        if any(phase.reference or phase.arrival for phase in entity.phases):
+            fastest = max(fastest, self.ego.speed + 10.0)
+        lane_points = lane_path(self.graph, place, self._way(fastest, limits))
         start_offset = -math.sin(pose.yaw) * (pose.x - lane_points[0, 0]) + math.cos(pose.yaw) * (
             pose.y - lane_points[0, 1]
         )
@@ -479,19 +514,12 @@ class _Reader:
         if len(distances) < 2:
             return ()
         resampled = np.stack([np.interp(distances, arc_lengths, lane_points[:, axis]) for axis in range(2)], 1)
-        offsets = np.full(len(distances), start_offset)
-        if entity.change is not None:
-            change_start, lanes, length = entity.change
-            width = self.graph.at(place.lane, place.s)[3]
-            change_share = np.clip((distances - change_start) / length, 0.0, 1.0)
-            # A half cosine has no kink at either end of the lane change.
-            offsets = offsets + lanes * width * 0.5 * (1.0 - np.cos(np.pi * change_share))
         tangents = np.gradient(resampled, axis=0)
         normals = np.stack([-tangents[:, 1], tangents[:, 0]], 1) / np.hypot(*tangents.T)[:, None]
-        return tuple((x, y) for x, y in (resampled + offsets[:, None] * normals).tolist())
+        return tuple((x, y) for x, y in (resampled + start_offset * normals).tolist())
 
     def _plan(self, line: Route, forced: dict[str, str]) -> SignalPlan:
-        """The plan that forces just these signals; what no plan does is lost."""
+        """Return the plan that forces just these signals; what no plan does is lost."""
         if not forced:
             return SignalPlan()
         signal_numbers = {name: signal for signal, name in town_signals(self.town).items()}
@@ -517,16 +545,16 @@ class _Reader:
         return plan or SignalPlan()
 
 
-def _with_headings(positions: list[Element | None], poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
-    """Return the poses; world positions without a heading face the next position."""
-    result = list(poses)
-    for index, position in enumerate(positions):
-        world_position = None if position is None else position.find("WorldPosition")
-        if world_position is None or world_position.get("h") is not None or len(poses) < 2:
-            continue
-        start, end = (poses[index], poses[index + 1]) if index + 1 < len(poses) else (poses[index - 1], poses[index])
-        result[index] = replace(poses[index], yaw=math.atan2(end.y - start.y, end.x - start.x))
-    return tuple(result)
+def _distance(line: F64, point: tuple[float, float]) -> float:
+    """Return the distance of a point from a polyline [n, 2], m."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    share = np.clip(((point - start) * step).sum(1) / np.maximum((step**2).sum(1), 1e-9), 0.0, 1.0)
+    return float(np.hypot(*(start + share[:, None] * step - point).T).min())
+
+
+def _length(points: tuple[Pose, ...]) -> float:
+    """Return the length of a polyline, m."""
+    return float(np.hypot(*np.diff([(point.x, point.y) for point in points], axis=0).T).sum())
 
 
 def _is_straight(points: tuple[Pose, ...]) -> bool:

@@ -8,30 +8,37 @@ names begin with `ssad.`; facts that the format cannot express are reported to t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.triggers import EGO, default_rule, reference_of, trigger_groups
 from ssad.core.types import (
+    DEFAULT_FRICTION,
     AgentKind,
     Controller,
     Episode,
     EpisodeAgent,
     EpisodeLimits,
+    LateralPhase,
     Model,
+    Phase,
     PhaseTrigger,
     Pose,
     SignalState,
 )
 from ssad.simulators.carla.blueprints import BLUEPRINTS, CATEGORY
-from ssad.world.models import model
+from ssad.world.models import agent_model
 
 DATE: Final = "2026-01-01T00:00:00"  # required by the format; fixed, so that a scenario always gives the same text
 FAR: Final = 500.0  # m, length of the path of an agent that drives straight on
 EVERY: Final = 20  # every 20th point of a route becomes a waypoint
+LATERAL_TIME: Final = 3.0  # s of a lane change that states no pace
 _POLICIES = {Controller.AUTOPILOT: "autopilot", Controller.FOLLOW: "blind"}
 _MASS = {AgentKind.WALKER: 75.0, AgentKind.PROP: 50.0}  # kg; required by the format, used by nothing here
 
@@ -73,6 +80,7 @@ class _Writer:
         self.dt, self.until = dt, min(limits.max_steps * dt, limits.max_time)
         self.omissions: list[str] = []
         self.names = _unique_names([agent.name for agent in episode.agents])
+        self.events = self._event_names()
 
     def write(self, network: str) -> tuple[str, tuple[str, ...]]:
         scenario = self.episode.scenario
@@ -109,14 +117,30 @@ class _Writer:
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
         return text, tuple(self.omissions)
 
+    def _event_names(self) -> dict[tuple[str, str, int], str]:
+        """Return the name of the event of each phase: by agent, phase or lane change, and number."""
+        phases = [
+            (name, title, index, phase.name)
+            for name, agent in zip(self.names, self.episode.agents, strict=True)
+            for title, phases in _phase_lists(agent)
+            for index, phase in enumerate(phases)
+        ]
+        stated = [phase_name for *_, phase_name in phases]
+        return {
+            (name, title, index): phase_name
+            if stated.count(phase_name) == 1 and phase_name
+            else f"{name} {title} {index}"
+            for name, title, index, phase_name in phases
+        }
+
     # ------------------------------------------------------------ entities
 
     def _write_entity(self, entities: Element, name: str, agent: EpisodeAgent) -> None:
-        agent_model = model(agent.model)
+        body = agent_model(agent)
         scenario_object = _node(entities, "ScenarioObject", name=name)
         blueprint = BLUEPRINTS.get(agent.model, agent.model)
-        mass = _MASS.get(agent_model.kind, 1500.0)
-        if agent_model.kind == AgentKind.WALKER:
+        mass = _MASS.get(body.kind, 1500.0)
+        if body.kind == AgentKind.WALKER:
             body_element = _node(
                 scenario_object,
                 "Pedestrian",
@@ -125,23 +149,25 @@ class _Writer:
                 pedestrianCategory="pedestrian",
                 model=blueprint,
             )
-        elif agent_model.kind == AgentKind.PROP:
+        elif body.kind == AgentKind.PROP:
             body_element = _node(
                 scenario_object, "MiscObject", name=blueprint, mass=mass, miscObjectCategory="obstacle"
             )
         else:
             body_element = _node(
-                scenario_object, "Vehicle", name=blueprint, mass=mass, vehicleCategory=CATEGORY[agent_model.kind]
+                scenario_object, "Vehicle", name=blueprint, mass=mass, vehicleCategory=CATEGORY[body.kind]
             )
         _node(body_element, "ParameterDeclarations")
         bounding_box = _node(body_element, "BoundingBox")
-        _node(bounding_box, "Center", x=0.0, y=0.0, z=0.5 * agent_model.height)
-        _node(bounding_box, "Dimensions", width=agent_model.width, length=agent_model.length, height=agent_model.height)
-        if agent_model.kind not in _MASS:
-            _write_vehicle(body_element, agent_model)
+        _node(bounding_box, "Center", x=0.0, y=0.0, z=0.5 * body.height)
+        _node(bounding_box, "Dimensions", width=body.width, length=body.length, height=body.height)
+        if body.kind not in _MASS:
+            _write_vehicle(body_element, body)
         properties = _node(body_element, "Properties")
         _node(properties, "Property", name="type", value="simulation" if agent is not self._ego else "ego_vehicle")
         _node(properties, "Property", name="ssad.model", value=agent.model)
+        if agent.body.brake_build_up is not None:
+            _node(properties, "Property", name="ssad.brake_build_up", value=_text(agent.body.brake_build_up))
 
     @property
     def _ego(self) -> EpisodeAgent:
@@ -155,6 +181,12 @@ class _Writer:
             for signal_index, state in sorted(self.episode.signal_override.items())
             if signal_index in self.signals
         }
+        friction = self.episode.scenario.friction
+        if friction != DEFAULT_FRICTION:
+            environment = _node(
+                _node(_node(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="surface"
+            )
+            _node(environment, "RoadCondition", frictionScaleFactor=friction / DEFAULT_FRICTION)
         unmapped_count = len(self.episode.signal_override) - len(mapped_signals)
         for signal, state in mapped_signals.items():
             infrastructure = _node(_node(actions, "GlobalAction"), "InfrastructureAction")
@@ -182,7 +214,7 @@ class _Writer:
             agent_actions = _node(actions, "Private", entityRef=name)
             action = _node(agent_actions, "PrivateAction")
             _write_position(_node(action, "TeleportAction"), agent.pose)
-            if model(agent.model).kind == AgentKind.PROP:
+            if agent_model(agent).kind == AgentKind.PROP:
                 continue
             _write_speed(_node(agent_actions, "PrivateAction"), agent.speed, "step", "time", 0.0)
             policy = agent.policy or _POLICIES.get(agent.controller, "")
@@ -225,18 +257,18 @@ class _Writer:
     def _write_story(self, board: Element) -> None:
         act = None
         for name, agent in zip(self.names[1:], self.episode.agents[1:], strict=True):
-            if not (agent.trajectory or (agent.controller == Controller.SCRIPT and agent.phases)):
+            is_scripted = agent.controller == Controller.SCRIPT and (agent.phases or agent.lateral or agent.speed)
+            if not (agent.trajectory or is_scripted):
                 continue
             if act is None:
                 story = _node(board, "Story", name=self.episode.scenario.name)
                 act = _node(story, "Act", name="act")
             group = _node(act, "ManeuverGroup", name=f"group {name}", maximumExecutionCount=1)
             _node(_node(group, "Actors", selectTriggeringEntities=False), "EntityRef", entityRef=name)
-            maneuver = _node(group, "Maneuver", name=f"maneuver {name}")
             if agent.trajectory:
-                self._trajectory_event(maneuver, name, agent)
+                self._trajectory_event(_node(group, "Maneuver", name=f"maneuver {name}"), name, agent)
             else:
-                self._phase_events(maneuver, name, agent)
+                self._write_script(group, name, agent)
         if act is None:  # the format requires an act in a story
             return
         trigger = _node(act, "StartTrigger")
@@ -267,7 +299,9 @@ class _Writer:
             _node(_node(action, "EntityAction", entityRef=name), "DeleteEntityAction")
             _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"end of {name}", end_time)
 
-    def _phase_events(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
+    def _write_script(self, group: Element, name: str, agent: EpisodeAgent) -> None:
+        """Write path, speeds and lanes, each as a maneuver of its own: an event ends others of its maneuver only."""
+        maneuver = _node(group, "Maneuver", name=f"path of {name}")
         event = self._event(maneuver, f"{name} keeps its path", "parallel")
         if agent.route is not None:
             rows = np.column_stack([agent.route.xy, agent.route.yaw]).astype(np.float64)
@@ -280,38 +314,96 @@ class _Writer:
         _node(_node(follow_action, "TimeReference"), "None")
         _node(follow_action, "TrajectoryFollowingMode", followingMode="position")
         _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"path of {name}", 0.0)
-        agent_model = model(agent.model)
-        speed, previous_event = agent.speed, ""
-        for phase_index, phase in enumerate(agent.phases):
-            event = self._event(maneuver, f"{name} phase {phase_index}", "override")
-            action = _node(_node(event, "Action", name=f"{name} speed {phase_index}"), "PrivateAction")
-            if agent_model.kind == AgentKind.WALKER:
-                _write_speed(action, phase.speed, "step", "time", 0.0)
-            else:
-                acceleration = agent_model.max_accel if phase.speed >= speed else agent_model.max_brake
-                _write_speed(action, phase.speed, "linear", "rate", acceleration)
-            trigger = _node(event, "StartTrigger")
-            # phases are latched, one after another: an event waits until the previous one runs or is complete
-            for state in ("runningState", "completeState") if previous_event else ("",):
-                condition_group = _node(trigger, "ConditionGroup")
-                if phase.when.kind != "after":
-                    self._condition(condition_group, f"{name} condition {phase_index}", name, phase.when)
-                elif not previous_event:
-                    _by_time(condition_group, f"{name} condition {phase_index}", phase.when.value)
-                if state:
-                    delay = phase.when.value if phase.when.kind == "after" else 0.0
-                    value_condition = _node(
-                        _condition(condition_group, f"{name} {phase_index} after {phase_index - 1}", delay),
-                        "ByValueCondition",
-                    )
-                    _node(
-                        value_condition,
-                        "StoryboardElementStateCondition",
-                        storyboardElementType="event",
-                        storyboardElementRef=previous_event,
-                        state=state,
-                    )
-            speed, previous_event = phase.speed, f"{name} phase {phase_index}"
+        for title, phases in _phase_lists(agent):
+            if not phases:
+                continue
+            maneuver = _node(group, "Maneuver", name=f"every {title} of {name}")
+            before: list[str] = []  # events that a phase waits for
+            speed = agent.speed
+            for index, phase in enumerate(phases):
+                label = self.events[name, title, index]
+                event = self._event(maneuver, label, "override")
+                action = _node(_node(event, "Action", name=f"{label} action"), "PrivateAction")
+                if isinstance(phase, LateralPhase):
+                    self._write_lane_change(action, name, phase)
+                else:
+                    self._write_speed_phase(action, agent, phase, speed)
+                    speed = phase.speed or 0.0
+                self._write_trigger(event, name, phase, before)
+                before = [label, *before] if phase.anytime else [label]
+        if agent.lateral:
+            self.omissions.append(f"{name} changes lanes on its path: other programs leave the path then")
+
+    def _write_speed_phase(self, action: Element, agent: EpisodeAgent, phase: Phase, speed: float) -> None:
+        """Write the action of a phase; `speed` is the one before it."""
+        if phase.arrival is not None:
+            self._write_arrival(action, phase)
+            return
+        limits = agent_model(agent)
+        longitudinal = _node(action, "LongitudinalAction")
+        if phase.jerk is not None:
+            acceleration = abs(phase.acceleration or limits.max_accel)
+            profile = _node(longitudinal, "SpeedProfileAction", followingMode="follow")
+            if phase.reference:
+                profile.set("entityRef", self._agent(phase.reference))
+            _node(
+                profile,
+                "DynamicConstraints",
+                maxAcceleration=acceleration,
+                maxAccelerationRate=float(phase.jerk),
+                maxDeceleration=acceleration,
+                maxDecelerationRate=float(phase.jerk),
+            )
+            _node(profile, "SpeedProfileEntry", speed=float(phase.speed or 0.0))
+            return
+        speed_action = _node(longitudinal, "SpeedAction")
+        shape, dimension, value = _pace(phase.shape, phase.duration, phase.distance, phase.acceleration)
+        if value is None:
+            # Without a pace: full power or full brakes.
+            rising = (phase.speed or 0.0) >= (0.0 if phase.reference else speed)
+            shape, dimension, value = "linear", "rate", limits.max_accel if rising else limits.max_brake
+        _node(speed_action, "SpeedActionDynamics", dynamicsShape=shape, dynamicsDimension=dimension, value=float(value))
+        target = _node(speed_action, "SpeedActionTarget")
+        if not phase.reference:
+            _node(target, "AbsoluteTargetSpeed", value=float(phase.speed or 0.0))
+            return
+        _node(
+            target,
+            "RelativeTargetSpeed",
+            entityRef=self._agent(phase.reference),
+            value=float(phase.speed or 0.0),
+            speedTargetValueType="factor" if phase.factor else "delta",
+            continuous=phase.continuous,
+        )
+
+    def _write_arrival(self, action: Element, phase: Phase) -> None:
+        arrival = phase.arrival
+        assert arrival is not None
+        synchronize = _node(action, "SynchronizeAction", masterEntityRef=self._agent(arrival.reference))
+        for tag, point in (("TargetPositionMaster", arrival.reference_point), ("TargetPosition", arrival.point)):
+            _node(_node(synchronize, tag), "WorldPosition", x=float(point[0]), y=float(point[1]), z=0.0)
+        if phase.speed is not None:
+            _node(_node(synchronize, "FinalSpeed"), "AbsoluteSpeed", value=float(phase.speed))
+        if phase.acceleration is not None:
+            self.omissions.append("the acceleration on the way to a meeting point")
+
+    def _write_lane_change(self, action: Element, name: str, phase: LateralPhase) -> None:
+        change = _node(_node(action, "LateralAction"), "LaneChangeAction")
+        if phase.offset:
+            change.set("targetLaneOffset", _text(float(phase.offset)))
+        shape, dimension, value = _pace(phase.shape, phase.duration, phase.distance, phase.rate)
+        _node(
+            change,
+            "LaneChangeActionDynamics",
+            dynamicsShape=shape,
+            dynamicsDimension=dimension,
+            value=LATERAL_TIME if value is None else float(value),
+        )
+        _node(_node(change, "LaneChangeTarget"), "RelativeTargetLane", entityRef=name, value=phase.lanes)
+
+    def _agent(self, name: str) -> str:
+        """Return the name of an agent in the file."""
+        return self.names[0] if name == EGO else name
 
     def _event(self, maneuver: Element, name: str, priority: str) -> Element:
         return _node(maneuver, "Event", name=name, priority=priority, maximumExecutionCount=1)
@@ -328,28 +420,123 @@ class _Writer:
             _write_position(vertex, pose)
         return follow_action
 
-    def _condition(self, group: Element, label: str, name: str, condition: PhaseTrigger) -> None:
-        if condition.kind in ("always", "time"):
-            _by_time(group, label, condition.value if condition.kind == "time" else 0.0)
-            return
-        ego = self.names[0]
-        subject = name if condition.kind == "travelled" else ego
-        entity_condition = _by_entity(group, label, subject)
-        if condition.kind == "travelled":
-            _node(entity_condition, "TraveledDistanceCondition", value=float(condition.value))
-        elif condition.kind == "ego_speed":
-            _node(entity_condition, "SpeedCondition", value=float(condition.value), rule="greaterThan")
-        else:
+    def _write_trigger(self, event: Element, name: str, phase: Phase | LateralPhase, before: Sequence[str]) -> None:
+        """Write the trigger of a phase, which also waits for the events before it unless it may begin at any time."""
+        trigger = _node(event, "StartTrigger")
+        label = event.get("name", "")
+        for conditions in trigger_groups(phase.when):
+            states = [state for condition in conditions if (state := self._state(condition, name, before))]
+            if not phase.anytime:
+                stated = [state[0] for state in states]
+                states += [(other, 0.0, True) for other in before if other not in stated]
+            others = [condition for condition in conditions if self._state(condition, name, before) is None]
+            others = [condition for condition in others if condition.kind != "always"] or others[: not states]
+            # The format has no state "has begun": an event that has begun runs, or is complete.
+            ways = [("runningState", "completeState") if has_begun else ("completeState",) for *_, has_begun in states]
+            for way in product(*ways):
+                group = _node(trigger, "ConditionGroup")
+                for number, condition in enumerate(others):
+                    self._write_condition(group, f"{label} condition {number}", name, condition)
+                for (other, delay, _), other_state in zip(states, way, strict=True):
+                    self._write_state(group, f"{label} after {other}", other, other_state, delay)
+
+    def _state(self, condition: PhaseTrigger, name: str, before: Sequence[str]) -> tuple[str, float, bool] | None:
+        """Return event, delay, and whether it has begun, not ended, for a condition on an event; None: on others."""
+        if condition.kind == "after" and before:
+            return before[0], condition.value + condition.delay, True
+        if condition.kind in ("phase_start", "phase_end"):
+            event = self._event_of(condition.agent or name, condition.phase)
+            return event, condition.delay, condition.kind == "phase_start"
+        return None
+
+    def _write_state(self, group: Element, label: str, event: str, state: str, delay: float) -> None:
+        _node(
+            _node(_condition(group, label, delay), "ByValueCondition"),
+            "StoryboardElementStateCondition",
+            storyboardElementType="event",
+            storyboardElementRef=event,
+            state=state,
+        )
+
+    def _write_condition(self, group: Element, label: str, name: str, condition: PhaseTrigger) -> None:
+        """Write one condition of a trigger, on the time or on agents."""
+        kind = condition.kind
+        edge = {"both": "risingOrFalling"}.get(condition.edge, condition.edge)
+        rule = condition.rule or default_rule(kind)
+        if kind in ("always", "time", "after"):
+            value_condition = _node(_condition(group, label, condition.delay, edge), "ByValueCondition")
             _node(
-                entity_condition,
-                "RelativeDistanceCondition",
-                entityRef=self.names[1 + condition.actor],
+                value_condition,
+                "SimulationTimeCondition",
                 value=float(condition.value),
-                relativeDistanceType="euclidianDistance",
-                freespace=False,
-                rule="lessThan",
-                coordinateSystem="entity",
+                rule="greaterOrEqual" if rule == "above" or kind == "always" else "lessThan",
             )
+            return
+        agent = self._agent(condition.agent or (EGO if kind.startswith("ego_") else name))
+        entity_condition = _by_entity(group, label, agent, condition.delay, edge)
+        if kind == "ego_distance":
+            condition = replace(condition, kind="distance", reference=self.names[1 + condition.actor])
+        self._write_entity_condition(entity_condition, name, condition, rule)
+
+    def _write_entity_condition(self, parent: Element, name: str, condition: PhaseTrigger, rule: str) -> None:
+        kind, value = condition.kind, float(condition.value)
+        stated_rule = "greaterThan" if rule == "above" else "lessThan"
+        simple = {"ego_speed": "SpeedCondition", "speed": "SpeedCondition", "acceleration": "AccelerationCondition"}
+        reference = self._agent(reference_of(condition, name))
+        if kind == "travelled":
+            _node(parent, "TraveledDistanceCondition", value=value)
+            if rule == "below":
+                self.omissions.append(f"{name} waits for a short way travelled: the format has only long ones")
+        elif kind in simple:
+            _node(parent, simple[kind], value=value, rule=stated_rule)
+        elif kind == "relative_speed":
+            _node(parent, "RelativeSpeedCondition", entityRef=reference, value=value, rule=stated_rule)
+        elif kind == "standstill":
+            _node(parent, "StandStillCondition", duration=value)
+        elif kind == "position" and rule == "below":
+            reach = _node(parent, "ReachPositionCondition", tolerance=value)
+            _write_position(reach, self._point(condition))
+        else:
+            self._write_distance(parent, condition, reference, stated_rule)
+
+    def _write_distance(self, parent: Element, condition: PhaseTrigger, reference: str, rule: str) -> None:
+        along = condition.measure != "straight"
+        lateral, straight = condition.measure == "lateral", "euclidianDistance"
+        attributes = {
+            "value": float(condition.value),
+            "freespace": condition.free_space,
+            "rule": rule,
+            "relativeDistanceType": "lateral" if lateral else "longitudinal" if along else straight,
+            "coordinateSystem": "road" if along else "entity",
+        }
+        if condition.kind == "time_headway":
+            _node(parent, "TimeHeadwayCondition", entityRef=reference, **attributes)
+            if condition.position is not None:
+                self.omissions.append("a time headway to a position: the format has only those to entities")
+        elif condition.kind == "time_to_collision":
+            collision = _node(parent, "TimeToCollisionCondition", **attributes)
+            target = _node(collision, "TimeToCollisionConditionTarget")
+            if condition.position is None:
+                _node(target, "EntityRef", entityRef=reference)
+            else:
+                _write_position(target, self._point(condition))
+        elif condition.position is not None:
+            _write_position(_node(parent, "DistanceCondition", **attributes), self._point(condition))
+        else:
+            _node(parent, "RelativeDistanceCondition", entityRef=reference, **attributes)
+
+    def _point(self, condition: PhaseTrigger) -> Pose:
+        assert condition.position is not None
+        return Pose(*condition.position)
+
+    def _event_of(self, agent: str, phase: str) -> str:
+        """Return the name of the event of a phase of an agent."""
+        scripted = self.episode.agents[self.names.index(agent)]
+        for title, phases in _phase_lists(scripted):
+            for index, other in enumerate(phases):
+                if other.name == phase:
+                    return self.events[agent, title, index]
+        raise AssertionError(phase)
 
     def _write_stop_condition(self, trigger: Element) -> None:
         limits: EpisodeLimits = self.episode.limits
@@ -372,6 +559,11 @@ class _Writer:
         _write_position(
             _node(entity_condition, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1]
         )
+
+
+def _phase_lists(agent: EpisodeAgent) -> tuple[tuple[str, Sequence[Phase | LateralPhase]], ...]:
+    """Return the phases and the lateral phases of an agent, with the word for them."""
+    return ("phase", agent.phases), ("lane change", agent.lateral)
 
 
 def _unique_names(names: list[str]) -> list[str]:
@@ -418,8 +610,21 @@ def _write_speed(action: Element, speed: float, shape: str, dimension: str, valu
     _node(_node(speed_action, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=float(speed))
 
 
-def _condition(group: Element, name: str, delay: float = 0.0) -> Element:
-    return _node(group, "Condition", name=name, delay=float(delay), conditionEdge="none")
+def _pace(
+    shape: str, duration: float | None, distance: float | None, rate: float | None
+) -> tuple[str, str, float | None]:
+    """Return shape, dimension and value of the dynamics of a phase; no value: it states none."""
+    if shape == "step":
+        return shape, "time", 0.0
+    stated = (("time", duration), ("distance", distance), ("rate", None if rate is None else abs(rate)))
+    for dimension, value in stated:
+        if value is not None:
+            return shape, dimension, value
+    return shape, "time", None
+
+
+def _condition(group: Element, name: str, delay: float = 0.0, edge: str = "none") -> Element:
+    return _node(group, "Condition", name=name, delay=float(delay), conditionEdge=edge)
 
 
 def _by_time(group: Element, name: str, time: float) -> None:
@@ -427,8 +632,8 @@ def _by_time(group: Element, name: str, time: float) -> None:
     _node(value_condition, "SimulationTimeCondition", value=float(time), rule="greaterOrEqual")
 
 
-def _by_entity(group: Element, name: str, entity_name: str) -> Element:
-    entity_condition = _node(_condition(group, name), "ByEntityCondition")
+def _by_entity(group: Element, name: str, entity_name: str, delay: float = 0.0, edge: str = "none") -> Element:
+    entity_condition = _node(_condition(group, name, delay, edge), "ByEntityCondition")
     _node(
         _node(entity_condition, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef=entity_name
     )

@@ -34,7 +34,8 @@ def plan_of(graph: LaneGraph, route: Route, states: Mapping[int, SignalState], u
     """
     for ego_choice in _CHOICES:
         for other_choice in _CHOICES:
-            plan = SignalPlan(ego_choice, other_choice, until)
-            if forced_signals(graph, route, plan) == states:
-                return plan
+            for elsewhere in _CHOICES if ego_choice == "red" else _CHOICES[:1]:
+                plan = SignalPlan(ego_choice, other_choice, until, elsewhere)
+                if forced_signals(graph, route, plan) == states:
+                    return plan
     return None

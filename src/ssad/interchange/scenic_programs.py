@@ -21,6 +21,7 @@ import numpy as np
 
 from ssad.core.errors import ConfigError, MissingExtraError, RouteError, SSADError
 from ssad.core.generators import Base, GeneratorFactory, Outcome, Proposal
+from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
@@ -72,12 +73,10 @@ class SampledScenario:
     Attributes:
         scenario: The scenario.
         end_reason: Scenic's reason for the end of the simulation.
-        omissions: Features of the simulation that the scenario does not carry, one line each.
     """
 
     scenario: Scenario
     end_reason: str
-    omissions: tuple[str, ...]
 
 
 def load_program(path: Path, town: str | None = None, parameters: Mapping[str, Any] | None = None) -> ScenicProgram:
@@ -116,7 +115,14 @@ def load_program(path: Path, town: str | None = None, parameters: Mapping[str, A
     return ScenicProgram(path, town_name, load_town(town_name), compiled)
 
 
-def sample(program: ScenicProgram, seed: int, *, steps: int = STEPS, name: str | None = None) -> SampledScenario:
+def sample(
+    program: ScenicProgram,
+    seed: int,
+    *,
+    steps: int = STEPS,
+    name: str | None = None,
+    report: ImportReport | None = None,
+) -> SampledScenario:
     """Draw a scene, simulate it, and convert the simulation to a scenario.
 
     Args:
@@ -124,6 +130,7 @@ def sample(program: ScenicProgram, seed: int, *, steps: int = STEPS, name: str |
         seed: Seed of all of Scenic's draws.
         steps: Largest number of steps of 0.1 s.
         name: Name of the scenario; None: from the program and the seed.
+        report: Filled with what of the simulation the scenario does not carry.
 
     Raises:
         ConfigError: No scene, or no simulation, meets the program's requirements, or the program fails.
@@ -145,7 +152,7 @@ def sample(program: ScenicProgram, seed: int, *, steps: int = STEPS, name: str |
         raise ConfigError(f"{location}: none of {TRIES} simulations meets its requirements")
     label = name or f"{scenario_name(program.path.stem) or 'scenic'}/{seed:02d}"
     try:
-        return _scenario(program, simulation, label, seed)
+        return _scenario(program, simulation, label, seed, ImportReport(location) if report is None else report)
     except (ConfigError, RouteError) as error:
         raise type(error)(f"{location}: {error}") from None
 
@@ -250,11 +257,10 @@ def _suppress_output() -> Iterator[None]:
         yield
 
 
-def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int) -> SampledScenario:
+def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int, report: ImportReport) -> SampledScenario:
     rows = np.stack(drive.rows)
-    omissions: list[str] = []
     ego = rows[:, 0]
-    key_points, speed = _route(program, ego, omissions)
+    key_points, speed = _route(program, ego, report, f"seed {seed}")
     ego_route = route_along(program.graph, key_points)
     end_time = STEP * (len(rows) + 100)
     start_pose = Pose(*ego[0, :3].tolist())
@@ -279,8 +285,13 @@ def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int) -> Sampl
             and max(abs(extent - model_extent) for extent, model_extent in zip(size, _model_size(model), strict=True))
             > 0.01
         ):
-            omissions.append(f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'")
-    return SampledScenario(scenario, str(drive.result.terminationReason), tuple(dict.fromkeys(omissions)))
+            report.omit(
+                f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'",
+                f"seed {seed}, {drive.names[index]}",
+            )
+    reason = str(drive.result.terminationReason)
+    report.note(f"simulations end: {reason[:80]}", f"seed {seed}")
+    return SampledScenario(scenario, reason)
 
 
 def _model_size(model: str) -> tuple[float, float]:
@@ -299,7 +310,7 @@ def _actor(drive: Any, rows: F64, index: int, until: float) -> Actor:
     return Actor(drive.names[index], drive.models[index], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
 
 
-def _route(program: ScenicProgram, ego: F64, omissions: list[str]) -> tuple[tuple[Pose, ...], float]:
+def _route(program: ScenicProgram, ego: F64, report: ImportReport, place: str) -> tuple[tuple[Pose, ...], float]:
     """Return the key points of the ego's route, and its speed at the start, m/s."""
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego[:, :2], axis=0).T))])
     start = Pose(*ego[0, :3].tolist())
@@ -312,7 +323,7 @@ def _route(program: ScenicProgram, ego: F64, omissions: list[str]) -> tuple[tupl
                 extended = (*route, *_key_points_ahead(program.graph, route[-1], extension)[1:]) if extension else route
                 if route_along(program.graph, extended).length < 1.5 * distances[-1] + extension + 10.0:
                     return extended, float(ego[0, 3])
-        omissions.append("the way of the ego, which leaves its lanes: its lane is its route")
+        report.omit("the way of the ego, which leaves its lanes: its lane is its route", place)
     return _key_points_ahead(program.graph, start), float(ego[0, 3])
 
 

@@ -13,6 +13,7 @@ import jinja2
 from ssad.metrics import METRICS
 from ssad.report.artefacts import artefact_problems
 from ssad.report.load import Run
+from ssad.report.matrix import matrix_text, run_matrices, shade
 from ssad.report.tables import Table, TableCell, to_csv
 from ssad.report.verdict import complete_verdict
 
@@ -49,6 +50,8 @@ def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **val
         lstrip_blocks=True,
     )
     environment.filters["heat"] = heat
+    environment.filters["shade"] = shade
+    environment.filters["matrix_text"] = matrix_text
     return environment.get_template(path.name).render(
         **{
             "run": run,
@@ -57,6 +60,7 @@ def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **val
             "verdict": complete_verdict(run, verdict),
             "problems": artefact_problems(run),
             "table_hash": TABLE_HASH,
+            "matrices": run_matrices(run),
             **values,
         }
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
 from operator import attrgetter
@@ -187,7 +187,9 @@ def town_version(graph: LaneGraph) -> str:
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
     """Return a scenario as plain data, as it stands in YAML, with its defaults written out."""
-    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    from ssad.scenarios.dynamic import scenario_data
+
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(scenario_data(scenario, defaults=True)))
     return data
 
 

@@ -35,7 +35,7 @@ from ssad.core.types import (
     Scenario,
 )
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
-from ssad.simulators.mirrored import MirroredSimulator
+from ssad.simulators.mirrored import MirroredSimulator, check_phases
 from ssad.world.kernels.data import Presence
 from ssad.world.world import World
 
@@ -277,6 +277,7 @@ class HighwayEnv(MirroredSimulator):
     """
 
     def __init__(self, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], *, assign: Scenes | None = None):
+        check_phases(episodes, "highway-env")
         self.mirror = World(episodes, graphs, assign=assign, models={"car": CAR})
         self.dt, self.batch, self.agents = self.mirror.dt, self.mirror.batch, self.mirror.agents
         self.episodes, self.graphs = self.mirror.episodes, self.mirror.graphs

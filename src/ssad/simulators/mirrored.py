@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ssad.core.driving import Belief, WorldState
-from ssad.core.types import I32, Bool, Controller
+from ssad.core.errors import ConfigError
+from ssad.core.types import I32, Bool, Controller, Episode, Phase
 from ssad.world.world import World
 
 
@@ -46,3 +47,35 @@ class MirroredSimulator:
     def truth(self) -> Belief:
         """Return the truth as a belief, as `World.truth`."""
         return self.mirror.truth()
+
+
+# Keys of a phase that state the course of a speed. A foreign simulator moves its vehicles by its own dynamics, so that
+# pedals alone cannot keep to them.
+_COURSE = ("acceleration", "jerk", "shape", "duration", "distance", "arrival")
+
+
+def check_phases(episodes: Sequence[Episode], simulator: str) -> None:
+    """Check that a foreign simulator can carry out the phases of all scripted agents.
+
+    Args:
+        episodes: The episodes.
+        simulator: Name of the simulator, for the message.
+
+    Raises:
+        ConfigError: A phase states the course of its speed, or an agent has lateral phases.
+    """
+    for episode in episodes:
+        for agent in episode.agents:
+            stated = [
+                f"{key} in phase {number + 1}"
+                for number, phase in enumerate(agent.phases)
+                for key in _COURSE
+                if getattr(phase, key) != getattr(Phase, key)
+            ]
+            if agent.lateral:
+                stated.append("lateral phases")
+            if stated:
+                raise ConfigError(
+                    f"scenario {episode.scenario.name}: {simulator} cannot carry out the motion of actor {agent.name}"
+                    f" ({stated[0]}); leave it out, or run the scenario in the embedded world"
+                )

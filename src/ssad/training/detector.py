@@ -23,6 +23,7 @@ from ssad.core.checkpoints import WeightsCard, copy_matching_weights, hash_state
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_annotated_image
+from ssad.core.import_report import ImportReport
 from ssad.core.seeding import digest
 from ssad.datasets.coco import CocoSet, read_coco
 from ssad.datasets.nuscenes.camera_truth import scenes_of
@@ -102,8 +103,15 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
     ]
 
 
-def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[TrainingImage]]:
+def coco_items(
+    folder: Path, split: str, report: ImportReport | None = None
+) -> tuple[tuple[str, ...], list[TrainingImage]]:
     """Return classes and images of a split of recordings.
+
+    Args:
+        folder: The folder.
+        split: Name of the split.
+        report: Filled with what came in, what is not read, and what is doubtful.
 
     Raises:
         ConfigError: The split does not exist.
@@ -111,7 +119,7 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Training
     path = folder / "annotations" / f"{split}.json"
     if not path.is_file():
         raise ConfigError(f"{folder}: no annotations/{split}.json; record it with: ssad record {folder} --clips drive")
-    data = read_coco(path)
+    data = read_coco(path, report=ImportReport(str(path)) if report is None else report)
     truths = coco_truth(data)
     return data.classes, [
         TrainingImage(partial(read_annotated_image, image.file, width=image.width, height=image.height), truth)
@@ -193,7 +201,7 @@ def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: s
 
 def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, report: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
-    sources, options = _items(plan, is_3d=recipe.is_3d)
+    sources, options = _items(plan, is_3d=recipe.is_3d, report=report)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
         unmatched_weights = copy_matching_weights(detector, load_weights(plan.weights), str(plan.weights))
@@ -277,7 +285,7 @@ def _card_epochs(weights: Path) -> int:
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
 
-def _items(plan: DetectorPlan, *, is_3d: bool) -> tuple[list[TrainingImage], dict[str, Any]]:
+def _items(plan: DetectorPlan, *, is_3d: bool, report: Say = print) -> tuple[list[TrainingImage], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
     if not is_3d and plan.val_data is not None:
@@ -287,7 +295,10 @@ def _items(plan: DetectorPlan, *, is_3d: bool) -> tuple[list[TrainingImage], dic
     else:
         sources = []
         for folder in plan.data:
-            class_names, folder_items = coco_items(folder, plan.split)
+            account = ImportReport(str(folder))
+            class_names, folder_items = coco_items(folder, plan.split, account)
+            if account.omissions or account.doubts:
+                report(account.text(f"data {folder}, split {plan.split}:"))
             if options and options["classes"] != class_names:
                 raise ConfigError(f"{folder}: other classes than {plan.data[0]}")
             options["classes"] = class_names
@@ -379,7 +390,8 @@ def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[...
             if folder.name not in images_by_folder:
                 images_by_folder[folder.name] = load_images(coco_items(folder, split)[1], device=device)
             image_set = images_by_folder[folder.name]
-            coco_set = read_coco(folder / "annotations" / f"{split}.json")
+            path = folder / "annotations" / f"{split}.json"
+            coco_set = read_coco(path, report=ImportReport(str(path)))
             scores = score_2d(detector, image_set, classes=coco_set.classes, device=device)
             metrics |= {f"{folder.name}_{name}": value for name, value in scores.items()}
             target_set = ImageSet(image_set.pictures, tuple(coco_truth(coco_set, target=True)))

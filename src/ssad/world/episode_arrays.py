@@ -13,10 +13,11 @@ from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import TURN, LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, PhaseCondition, Roads, TurnRank, array_types
+from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, Scripts, TurnRank, array_types
 from ssad.world.kernels.shared import BRIDGE
 from ssad.world.models import GRAVITY, agent_model, lateral_grip
 from ssad.world.roads.query import CELL, DRIVABLE, grid_of
+from ssad.world.scripts import ScriptTables
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
@@ -191,7 +192,7 @@ def _height(route: Route, graph: LaneGraph) -> F32:
     return heights
 
 
-def _lane_left(
+def lane_left(
     route: Route, part: npt.NDArray[np.intp], graph: LaneGraph, lane: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return the offset of a lane's centre to the left of some route points (negative: right), and its width."""
@@ -238,7 +239,7 @@ def _beside(route: Route, graph: LaneGraph) -> F32:
             same_direction = graph.is_same_direction(lane, neighbour)
             if column == 2 and not same_direction:
                 continue
-            distance, width = _lane_left(route, points, graph, neighbour)
+            distance, width = lane_left(route, points, graph, neighbour)
             # not where the route itself changes lane
             adjacent = np.abs(np.abs(distance) - 0.5 * (route.width[points] + width)) < 0.4
             table[points, column] = np.where(adjacent, np.abs(distance), 0.0)
@@ -333,14 +334,6 @@ def _put_agent(  # noqa: PLR0917
         a["habit"][e, i] = driver.lane_offset, driver.errors, driver.key
     a["route"][e, i] = route
     a["track"][e, i] = track
-    a["phase_count"][e, i] = len(agent.phases)
-    for phase_index, phase in enumerate(agent.phases):
-        a["phase_when"][e, i, phase_index] = (
-            PhaseCondition[phase.when.kind.upper()],
-            phase.when.value,
-            phase.when.actor + 1,
-        )
-        a["phase_speed"][e, i, phase_index] = phase.speed
 
 
 @dataclass(frozen=True)
@@ -350,6 +343,9 @@ class Bank:
     Attributes:
         episodes: Arrays of the episodes on the device.
         roads: Arrays of the roads on the device.
+        scripts: Phases of scripted agents on the device.
+        script_rows: Rows of phases and words of history that the widest episode needs; (0, 0): no agent is scripted.
+        script_sizes: [E, 2] The same for each episode.
         tables: The same routes for the host.
         agents: A, slots per scene.
         kind: [E, A] AgentKind of every slot.
@@ -362,6 +358,9 @@ class Bank:
 
     episodes: EpisodeArrays
     roads: Roads
+    scripts: Scripts
+    script_rows: tuple[int, int]
+    script_sizes: npt.NDArray[np.int32]
     tables: RoadTables
     agents: int
     kind: npt.NDArray[np.int32]
@@ -372,12 +371,13 @@ class Bank:
     until: F32
 
 
-def build(
+def build(  # noqa: PLR0917
     episodes: Sequence[Episode],
     graphs: Mapping[str, LaneGraph],
     device: str,
     ego: Controller | None,
     models: Mapping[str, Model],
+    dt: float = 0.1,
 ) -> Bank:
     """Build the arrays of all episodes on a device.
 
@@ -387,6 +387,7 @@ def build(
         device: Warp device.
         ego: Controller that replaces the egos'; None: as the episodes say.
         models: Bodies by name.
+        dt: Length of a step, s.
 
     Raises:
         ConfigError: There is no episode, or one of them cannot be built.
@@ -397,7 +398,6 @@ def build(
         _check(episode)
     towns = sorted({episode_index.town for episode_index in episodes})
     agent_count = max(len(episode_index.agents) for episode_index in episodes)
-    phase_count = max(1, *(len(arrays.phases) for episode_index in episodes for arrays in episode_index.agents))
     signal_count = max(1, *(len(graphs[town].signal_phase) for town in towns))
     # Agents whose body differs from that of their model get a row of their own.
     model_rows = {model: index for index, model in enumerate(models.values())}
@@ -412,16 +412,14 @@ def build(
         "cruise": np.zeros((*shape, 2), np.float32),
         "route": np.zeros((*shape, 2), np.int32),
         "track": np.zeros((*shape, 2), np.int32),
-        "phase_count": np.zeros(shape, np.int32),
-        "phase_when": np.zeros((*shape, phase_count, 3), np.float32),
-        "phase_speed": np.zeros((*shape, phase_count), np.float32),
+        "script": np.zeros((*shape, 4), np.int32),
         "town": np.zeros(len(episodes), np.int32),
         "signal": np.full((len(episodes), signal_count), -1, np.int32),
         "limits": np.zeros((len(episodes), 4), np.float32),
         "contact": np.zeros(len(episodes), np.int32),
         "surface": np.zeros((len(episodes), 3), np.float32),
     }
-    pool = _Pool()
+    pool, scripts = _Pool(), ScriptTables(dt)
     for episode_index, episode in enumerate(episodes):
         graph = graphs[episode.town]
         bodies = [agent_model(agent, models) for agent in episode.agents]
@@ -433,6 +431,7 @@ def build(
                 route = pool.add(agent.route, graph)
             model_row = model_rows.setdefault(body, len(model_rows))
             _put_agent(arrays, episode_index, agent_index, agent, model_row, route, pool.follow(agent))
+        scripts.add(episode, arrays["script"][episode_index])
         if ego is not None:
             arrays["controller"][episode_index, 0] = int(ego)
         arrays["town"][episode_index] = towns.index(episode.town)
@@ -459,6 +458,9 @@ def build(
     return Bank(
         bank,
         _roads(town_graphs, pool, device),
+        scripts.build(device),
+        scripts.sizes,
+        scripts.episode_sizes,
         _tables(town_graphs, pool),
         agent_count,
         np.where(

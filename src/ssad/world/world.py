@@ -21,12 +21,23 @@ from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, 
 from ssad.world.belief import Lanes, check, complete_belief, lanes_of, rest_times
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import fill_all_rows
-from ssad.world.kernels.data import BLOCK, HORIZON, Ego, PerceivedAgents, Presence, State, Work, array_types
+from ssad.world.kernels.data import (
+    BLOCK,
+    HORIZON,
+    Ego,
+    PerceivedAgents,
+    Presence,
+    ScriptState,
+    State,
+    Work,
+    array_types,
+)
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import advance_noise, reset_noise
 from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
+from ssad.world.kernels.script import restart_scripts, run_scripts
 from ssad.world.kernels.traffic import react_to_agents, scan_all_agents
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
@@ -34,12 +45,13 @@ from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
+_SCRIPT = array_types(ScriptState)
 # The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
 _OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
 _IMMUTABLE = ("episodes", "graphs", "models", "bank")  # attributes that deep copies share
 # Attributes that live on the device or refer to it: a copy makes its own.
 _ON_DEVICE = (
-    *("arrays", "seen", "ego", "controls", "places", "_mask", "work", "noise", "_views", "_looks"),
+    *("arrays", "seen", "ego", "script", "controls", "places", "_mask", "work", "noise", "_views", "_looks"),
     *("_restart", "_see", "_plan", "_advance", "_graph"),
 )
 
@@ -98,7 +110,7 @@ class World:
         self.device = device
         self.models: Mapping[str, Model] = dict(models)
         self._ego_controller = ego
-        self.bank = build(self.episodes, graphs, device, ego, models)
+        self.bank = build(self.episodes, graphs, device, ego, models, dt)
         # All scenes have as many slots as the widest episode; the others leave theirs empty.
         self.agents = self.bank.agents
         assignment = np.arange(len(self.episodes)) if assign is None else np.asarray(assign)
@@ -128,6 +140,16 @@ class World:
         for name, array_type in _EGO.items():
             setattr(self.ego, name, wp.zeros(self.batch, dtype=array_type.dtype, device=device))
         agent_shape = (self.batch, self.agents)
+        self.script = ScriptState()
+        for name, array_type in _SCRIPT.items():
+            script_shape = {
+                "begun": (self.batch, self.bank.script_rows[0]),
+                "ended": (self.batch, self.bank.script_rows[0]),
+                "history": (self.batch, self.bank.script_rows[1]),
+            }.get(name, agent_shape)
+            # a world without scripts keeps none
+            script_shape = script_shape if self._scripted else (1, 1)
+            setattr(self.script, name, wp.zeros(script_shape, dtype=array_type.dtype, device=device))
         self.controls = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self.places = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
@@ -150,7 +172,7 @@ class World:
         arrays = state["saved_arrays"]
         self.__dict__.update({name: value for name, value in state.items() if name != "saved_arrays"})
         if "bank" not in state:
-            self.bank = build(self.episodes, self.graphs, self.device, self._ego_controller, self.models)
+            self.bank = build(self.episodes, self.graphs, self.device, self._ego_controller, self.models, self.dt)
         self._allocate(arrays["episode"], believed=self.belief_capacity)
         for name, value in arrays.items():
             self.put(name, value)
@@ -200,6 +222,7 @@ class World:
         pair_threads = 1 if self.device == "cpu" else min(pair_capacity, 1 << 21)
         dt, substeps, autoreset = self._settings
         bank, roads, state, perceived = self.bank.episodes, self.bank.roads, self.arrays, self.seen
+        scripts = self.bank.scripts
 
         # threads of a scene: on CPU to begin one costs more than what most of them have to do
         agent_threads = 1 if self.device == "cpu" else self.agents
@@ -210,8 +233,13 @@ class World:
             if self.chance is not None:
                 noise_inputs = [state, self.noise, self._mask, ended_too, self.agents, self.chance.stretches]
                 noise_reset = [self.launch(reset_noise, self.batch, noise_inputs)]
+            script_reset = []
+            if self._scripted:
+                script_inputs = [bank, roads, scripts, state, self.script, self._mask, ended_too, self.agents]
+                script_reset = [self.launch(restart_scripts, self.batch, [*script_inputs, *self.bank.script_rows])]
             return [
                 *noise_reset,
+                *script_reset,
                 self.launch(
                     restart, launch_shape, [bank, roads, state, self._mask, ended_too, self.agents, agent_threads]
                 ),
@@ -242,6 +270,11 @@ class World:
                 launch_shape,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, agent_threads],
             ),
+            *(
+                [self.launch(run_scripts, self.batch, [bank, roads, scripts, state, self.script, self.agents, dt])]
+                if self._scripted
+                else []
+            ),
             self.launch(
                 drive, launch_shape, [bank, roads, state, perceived, self.agents, row_count, agent_threads, dt]
             ),
@@ -253,7 +286,7 @@ class World:
             self.launch(
                 move,
                 launch_shape,
-                [bank, roads, state, self.controls, self.places, self.agents, agent_threads, dt, substeps],
+                [bank, roads, state, self.script, self.controls, self.places, self.agents, agent_threads, dt, substeps],
             ),
             self.launch(contact, launch_shape, [bank, roads, state, self.work, self.agents, agent_threads]),
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
@@ -263,7 +296,17 @@ class World:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the arrays that hold everything that changes, as long as no ego plans over a belief."""
-        return (*_STATE, *(f"ego.{name}" for name in _EGO), *(f"noise.{name}" for name in self._noisy))
+        script_names = _SCRIPT if self._scripted else ()
+        return (
+            *_STATE,
+            *(f"ego.{name}" for name in _EGO),
+            *(f"noise.{name}" for name in self._noisy),
+            *(f"script.{name}" for name in script_names),
+        )
+
+    @property
+    def _scripted(self) -> bool:
+        return self.bank.script_rows[0] > 0
 
     @property
     def _noisy(self) -> tuple[str, ...]:
@@ -309,7 +352,8 @@ class World:
         """Return an array as numpy: a view on CPU, a copy on CUDA.
 
         Args:
-            name: Name of a state array; `ego.<name>`, `seen.<name>` or `noise.<name>` for the other groups.
+            name: Name of a state array; `ego.<name>`, `seen.<name>`, `noise.<name>` or `script.<name>` for the other
+                groups.
         """
         view = self._views.get(name)
         if view is None:
@@ -324,7 +368,7 @@ class World:
         group, _, member = name.rpartition(".")
         if group == "noise":
             return getattr(self.noise, member)
-        return getattr({"": self.arrays, "ego": self.ego, "seen": self.seen}[group], member)
+        return getattr({"": self.arrays, "ego": self.ego, "seen": self.seen, "script": self.script}[group], member)
 
     def put(self, name: str, value: npt.NDArray[Any]) -> None:
         """Fill the array that `array(name)` reads."""
@@ -642,6 +686,11 @@ class World:
             inverse
         ]
 
+    def _script_size(self, scene: int, name: str) -> int:
+        """Return the number of phases, or words of history, that a scene uses."""
+        sizes = self.bank.script_sizes[self.array("episode")[scene]]
+        return int(sizes[1 if name == "script.history" else 0])
+
     def ended(self) -> npt.NDArray[np.int32]:
         """Return `End` [B], index into ENDS."""
         return self.array("end")
@@ -655,8 +704,9 @@ class World:
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world. Raises ConfigError if its shape does not fit."""
-        if any(name.startswith("noise.") for name in snapshot.arrays) != bool(self._noisy):
-            raise ConfigError("snapshot does not fit this world: only one of them has noise")
+        for group, is_present in (("noise", bool(self._noisy)), ("script", self._scripted)):
+            if any(name.startswith(f"{group}.") for name in snapshot.arrays) != is_present:
+                raise ConfigError(f"snapshot does not fit this world: only one of them has {group}")
         saved_rows = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
         if saved_rows > self.belief_capacity:
             self._make_room(saved_rows)
@@ -688,9 +738,15 @@ class World:
             hasher = hashlib.sha256()
             for name, values in arrays.items():
                 scene_values = values[scene]
-                if name in {"since", "pending"} and not scene_values.any():
-                    # no phase waits for another, no driver has a reaction time: hashes are those of before some could
+                if name == "pending" and not scene_values.any():
+                    # hashes are those of before there were drivers that react
                     continue
+                if name.startswith("script."):
+                    if not scene_values.any():
+                        continue  # a scene without scripts has the hash that it has in a world without scripts
+                    if name in ("script.begun", "script.ended", "script.history"):
+                        hasher.update(scene_values[: self._script_size(scene, name)].tobytes())
+                        continue
                 # empty slots that only the batch's widest scene needs do not count
                 hasher.update(
                     np.ascontiguousarray(

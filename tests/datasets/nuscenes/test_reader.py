@@ -23,7 +23,7 @@ from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.rotations import quaternion_to_matrix, slerp
 from ssad.datasets.nuscenes import index
-from ssad.datasets.nuscenes.files import points_bytes, read_points
+from ssad.datasets.nuscenes.files import points_bytes, read_frame_image, read_frame_points, read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData
 from ssad.datasets.nuscenes.schema import TABLES
@@ -414,10 +414,39 @@ def test_choice_of_version_and_scene(copy: Path, tmp_path: Path) -> None:
         NuScenes(tmp_path / "empty")
 
 
-def test_tables_behind_links(tiny: Path, tmp_path: Path, on_disk: Path) -> None:
+def test_tables_behind_links(tiny: Path, tmp_path: Path, on_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.symlink(tiny / VERSION, tmp_path / VERSION)
+    with pytest.raises(StoreError, match=rf"leads out of .*; copy that here, or allow .* SSAD_DATA_LINKS={tiny}"):
+        load_all(tmp_path)
+    monkeypatch.setenv("SSAD_DATA_LINKS", f"/nowhere:{tiny.parent}")
     assert equal_scenes(load_all(tmp_path), load_all(tiny))
     assert len(list(on_disk.iterdir())) == 1  # one and the same folder
+
+
+@pytest.mark.parametrize("name", ["samples", "samples/CAM_FRONT", "sweeps/LIDAR_TOP", f"{VERSION}/scene.json"])
+def test_links_inside_are_followed_and_links_out_are_refused(copy: Path, tmp_path: Path, name: str) -> None:
+    scenes = load_all(copy)
+    for folder in ("samples/CAM_FRONT", "sweeps/LIDAR_TOP", "store"):
+        (copy / folder).mkdir(parents=True)
+    (copy / name).rename(copy / "store" / "x")
+    (copy / name).symlink_to(copy / "store" / "x")
+    assert equal_scenes(load_all(copy), scenes)
+    (copy / "store" / "x").rename(tmp_path / "outside")
+    (copy / name).unlink()
+    (copy / name).symlink_to(tmp_path / "outside")
+    with pytest.raises(StoreError, match=f"{name}: leads out of"):
+        load_all(copy)
+
+
+def test_files_that_lead_out_are_not_read(tiny: Path, copy: Path) -> None:
+    scene = load_all(copy)[0]
+    for modality, read in (("camera", read_frame_image), ("lidar", read_frame_points)):
+        frame = next(frame for frame in scene.frames if frame.modality == modality)
+        path = copy / frame.filename
+        path.parent.mkdir(parents=True)
+        path.symlink_to(tiny / frame.filename)
+        with pytest.raises(StoreError, match="leads out of"):
+            read(copy, frame)
 
 
 # ---------------------------------------------------------------- files of sensors

@@ -345,6 +345,115 @@ def test_a_basic_agent_drives_the_plan(tmp_path: Path) -> None:
     assert 1.0 < 249.0 - 0.5 * waits.length[1] - waits.x[-1, 0] - 0.5 * waits.length[0] < 10.0
 
 
+# what agents import of other modules, and what they do with it
+IMPORTS = """
+import carla
+import srunner.scenariomanager.carla_data_provider as provider
+from agents.navigation.basic_agent import *
+from agents.navigation.behavior_agent import BehaviorAgent
+from agents.navigation.controller import VehiclePIDController
+from agents.navigation.local_planner import LocalPlanner, LocalPlannerBehavior, RoadOption
+from agents.tools.misc import compute_distance, draw_waypoints, get_speed, is_within_distance
+from carla import ColorConverter
+from leaderboard.autoagents.autonomous_agent import AutonomousAgent, Track
+from leaderboard.envs.sensor_interface import SensorInterface, SensorReceivedNoData
+from leaderboard.utils.route_manipulation import interpolate_trajectory
+from leaderboard.utils.statistics_manager import StatisticsManager
+from srunner.scenariomanager.carla_data_provider import CarlaActorPool, CarlaDataProvider
+from srunner.scenariomanager.scenarioatomics.atomic_criteria import CollisionTest
+from srunner.tools.scenario_helper import get_waypoint_in_distance
+
+
+class OwnCriterion(CollisionTest):
+    pass
+
+
+def get_entry_point():
+    return "Mixed"
+
+
+class Mixed(AutonomousAgent):
+    def setup(self, path_to_conf_file):
+        self.track, self.driver, self.facts = Track.SENSORS, None, []
+
+    def sensors(self):
+        return [{"type": "sensor.speedometer", "id": "speed"}]
+
+    def run_step(self, input_data, timestamp):
+        hero = CarlaDataProvider.get_hero_actor()
+        self.facts.append((get_speed(hero), 3.6 * input_data["speed"][1]["speed"], hasattr(CarlaActorPool, "x")))
+        if self.driver is None:
+            locations = [transform.location for transform, _ in self._global_plan_world_coord]
+            self.gps, route = interpolate_trajectory(locations)
+            route = [(provider.CarlaDataProvider.get_map().get_waypoint(t.location), option) for t, option in route]
+            self.driver = KIND
+            self.driver.set_global_plan(route)
+        try:
+            return self.driver.run_step()
+        except SensorReceivedNoData:
+            return carla.VehicleControl(brake=1.0)
+
+
+class Pid:
+    def __init__(self, hero):
+        gains = {"K_P": 1.0, "K_D": 0.1, "dt": 0.05}
+        self.hero, self.controller = hero, VehiclePIDController(hero, gains, gains)
+
+    def set_global_plan(self, route):
+        self.route = route
+
+    def run_step(self):
+        transform = CarlaDataProvider.get_hero_actor().get_transform()
+        ahead = [w for w, _ in self.route if is_within_distance(w.transform, transform, 50.0, (-1.0, 90.0))]
+        aims = [w for w in ahead if compute_distance(w.transform.location, transform.location) > 4.0]
+        return self.controller.run_step(20.0, aims[0])
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "speed"),
+    [("LocalPlanner(hero)", 20.0), ("BehaviorAgent(hero, behavior='cautious')", 40.0), ("Pid(hero)", 20.0)],
+)
+def test_agents_import_what_they_may_not_need(tmp_path: Path, kind: str, speed: float) -> None:
+    """Planners and controllers drive along the plan; further names of the packages can be imported."""
+    path = tmp_path / "mixed.py"
+    path.write_text(IMPORTS.replace("KIND", kind))
+    town = load_town("ProvingGround")
+    episode = build_episode(load_scenarios("StraightObstacle/00")[0], town, seed=0)
+    episode = replace(episode, agents=episode.agents[:1], limits=replace(episode.limits, max_steps=60))
+    driver = make_system(f"leaderboard:{path}")
+    (trace,) = rollout(World([episode], {town.name: town}), driver)
+    agent = driver.act.__self__._agents[0]
+    assert trace.route_distance.max() < 0.5
+    assert 3.6 * trace.speed[-1, 0] == pytest.approx(speed, abs=1.5)
+    for told, measured, has_name in agent.facts:
+        assert told == pytest.approx(measured, abs=0.01)
+        assert not has_name
+    (place, _), (start, _) = agent.gps[0], agent._global_plan[0]
+    assert (place["lat"], place["lon"]) == pytest.approx((start["lat"], start["lon"]), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("deed", "message"),
+    [
+        ("StatisticsManager()", r"leaderboard\.utils\.statistics_manager\.StatisticsManager has no stand-in"),
+        ("OwnCriterion()", r"srunner\.scenariomanager\.scenarioatomics\.atomic_criteria\.CollisionTest has no"),
+        ("LocalPlannerBehavior.OVERTAKE", r"local_planner\.LocalPlannerBehavior\.OVERTAKE has no stand-in"),
+        ("CarlaDataProvider.request_new_actor('car', None)", r"CarlaDataProvider\.request_new_actor has no stand-in"),
+        ("CarlaDataProvider.get_hero_actor().apply_control(None)", r"carla\.Actor\.apply_control needs a CARLA"),
+    ],
+)
+def test_the_use_of_what_has_no_stand_in_is_one_line(tmp_path: Path, deed: str, message: str) -> None:
+    path = tmp_path / "mixed.py"
+    path.write_text(IMPORTS.replace("KIND", deed))
+    town = load_town("ProvingGround")
+    episode = build_episode(load_scenarios("StraightObstacle/00")[0], town, seed=0)
+    driver = make_system(f"leaderboard:{path}")
+    with pytest.raises(ConfigError, match=message) as error:
+        rollout(World([episode], {town.name: town}), driver)
+    assert "\n" not in str(error.value)
+
+
 NETWORK = """
 import carla
 import torch

@@ -110,6 +110,53 @@ def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp
     assert "scenario mine: its type Custom has no parameters of other agents to search" in out.stderr
 
 
+RANGES = """\
+name: my/crossing
+type: Custom
+town: ProvingGround
+route: [{x: 217.0, y: -5.25}, {x: 317.0, y: -5.25}]
+target_speed: 10.0
+parameters:
+  ego_speed: 10
+  walk: {value: 1.5, range: [0.5, 3.0]}
+  distance: {value: 20.0, range: [10, 40]}
+limits: {max_steps: 40}
+actors:
+- name: walker
+  model: walker
+  pose: {x: 247.0, y: -9.0, yaw: pi / 2}
+  phases: [{speed: walk, when: {kind: ego_distance, value: distance}}]
+"""
+
+
+@pytest.mark.parametrize("generator", ["random", "halton", "cma-es", "bayesian", "l2c"])
+def test_the_ranges_of_a_scenario_with_actors_of_its_own_are_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, generator: str
+) -> None:
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: {})
+    outcomes: list[Outcome] = []
+    run_trials = Trials.run
+
+    def recording_run(trials: Trials, proposals: Any) -> list[Outcome]:
+        outcomes.extend(batch := run_trials(trials, proposals))
+        return batch
+
+    monkeypatch.setattr(Trials, "run", recording_run)
+    (tmp_path / "mine.yaml").write_text(RANGES)
+    settings = [f"generators={generator}", "budget=12", "keep=0", "grade=false", "systems=autopilot"]
+    plan = Adversarial().plan(load_suite("adversarial-quick", [*settings, f"scenarios={tmp_path / 'mine.yaml'}"]))
+    (line,) = Adversarial().execute([plan.cells[0]], Job(tmp_path, "cpu", {})).values()
+    assert (line["metrics"]["applies"], line["n"]) == (True, 12)
+    points = {
+        (actor.phases[0].speed or 0.0, actor.phases[0].when.value)
+        for outcome in outcomes
+        for actor in outcome.proposal.scenario.actors
+    }
+    assert len(points) >= 11
+    assert all(0.5 <= walk <= 3.0 and 10.0 <= distance <= 40.0 for walk, distance in points)
+    assert not any(outcome.failure for outcome in outcomes)
+
+
 def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -170,6 +170,23 @@ def test_fog_stands_over_an_upright_road_whatever_the_orientation(tmp_path: Path
         assert image[105:125].mean() > image[-20:].mean() + 20, f"{name}: the far road above, the near below"
 
 
+def test_links_to_allowed_folders_are_shifted_as_if_they_were_here(
+    kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outside = tmp_path / "elsewhere"
+    stored(street(), outside / "a" / "x.png")
+    (outside / "a" / "up").symlink_to("..")
+    (kitti / "image_3").symlink_to(outside / "a")
+    (kitti / "image_2" / "x.png").symlink_to(outside / "a" / "x.png")
+    monkeypatch.setenv("SSAD_DATA_LINKS", str(outside))
+    (folder,) = shift(kitti, tmp_path / "out", "uniform")
+    assert folder.reasons == ("image_3/up/a/up: a symbolic link to a folder that is listed already",)
+    for name in ("image_3/x.png", "image_2/x.png"):
+        path = tmp_path / "out" / "uniform-3" / name
+        assert not path.is_symlink()
+        assert difference(kitti / name, path) > 4
+
+
 def test_links_inside_are_repeated_and_links_outside_are_refused(kitti: Path, tmp_path: Path) -> None:
     (kitti / "image_2" / "alias.png").symlink_to("000000.png")
     (kitti / "left").symlink_to("image_2")
@@ -183,7 +200,9 @@ def test_links_inside_are_repeated_and_links_outside_are_refused(kitti: Path, tm
     (folder,) = shift(kitti, tmp_path / "out", "uniform")
     root = tmp_path / "out" / "uniform-3"
     assert (folder.shifted, folder.linked) == (2, 3)
-    remedy = f"a symbolic link that leads out of {kitti}; put what it leads to in its place"
+    remedy = (
+        f"a symbolic link that leads out of {kitti}; copy that here, or allow such links with SSAD_DATA_LINKS={outside}"
+    )
     assert folder.reasons == (
         f"image_2/x.png: {remedy}",
         f"image_3: {remedy}",

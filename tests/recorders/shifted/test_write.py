@@ -412,6 +412,18 @@ def test_options_that_make_no_sense(clean: Path, fog: Path, tmp_path: Path) -> N
     assert not out.exists()
 
 
+def test_links_of_a_shifted_root_lead_to_the_same_file_of_its_source_alone(
+    clean: Path, fog: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(fog, tmp_path / "fog-3", symlinks=True))
+    link = root / VERSION / "log.json"
+    assert link.resolve() == (clean / VERSION / "log.json").resolve()
+    NuScenes(root).scene(SCENES[0])
+    link.unlink()
+    link.symlink_to(clean / VERSION / "map.json")
+    fails(StoreError, lambda: NuScenes(root), "log.json", "leads out of", "map.json")
+
+
 def test_nothing_is_written_through_a_link_into_the_dataset(clean: Path, tmp_path: Path) -> None:
     before = tree(clean)
     for name in ("samples", "sweeps/CAM_FRONT", VERSION):

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.command import ssad
 
 from ssad.core.errors import FormatError
-from ssad.core.types import Pose
+from ssad.core.import_report import ImportReport
+from ssad.core.types import Pose, SignalPlan
 from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios, scenario_type
 from ssad.scenarios.dynamic.importer import _PARAMETERS
 from ssad.world.roads import load_graph
@@ -347,15 +349,39 @@ def test_leaderboard_scenarios_that_need_an_actor_and_routes_without_a_number(tm
     assert [len(s.placements) for s in found[:5]] == [0, 2, 0, 2, 0]
     assert (found[0].group, found[0].source) == ("StraightObstacle", "leaderboard route 0 of a.xml")
     (tmp_path / "t.json").write_text(json.dumps(table).replace('"T"', '"Elsewhere"'))
-    left_out: list[str] = []
-    assert [s.name for s in import_routes(tmp_path, omissions=left_out)] == [
+    report = ImportReport("folder")
+    assert [s.name for s in import_routes(tmp_path, report=report)] == [
         "leaderboard/a_0/FreeDrive",
         "leaderboard/a_1/FreeDrive",
     ]
-    assert left_out == [f"{tmp_path / 'a.xml'}: no trigger lies on the route (2 m, 10 degrees): a free drive"] * 2
+    assert report.notes == {
+        "routes on which no trigger lies (2 m, 10 degrees) become free drives": ["a.xml, route 0", "a.xml, route 1"]
+    }
+    assert report.omissions["JSON files that hold no triggers"] == ["other.json"]
+    assert len(report.omissions["triggers that lie on no route"]) > 0
+    assert report.contents == ["leaderboard 1.0: 2 scenarios of 2 routes"]
     (tmp_path / "t.json").write_text(json.dumps(table))
     (tmp_path / "a.xml").write_text(ROUTE.replace('x="0"', 'x="-5e7"'))
     with pytest.raises(FormatError, match=r"a\.xml: route\[0\]: beyond 100000 m"):
+        import_routes(tmp_path)
+
+
+def test_routes_of_leaderboard_2_without_scenarios_are_free_drives(tmp_path: Path) -> None:
+    text = (
+        '<routes><route id="7" town="T"><weathers/><waypoints><position x="0" y="10" z="0"/>'
+        '<position x="50" y="10" z="0"/><position x="50" y="40" z="0"/></waypoints><scenarios>{}</scenarios></route>'
+        "</routes>"
+    )
+    (tmp_path / "b.xml").write_text(text.format(""))
+    (drive,) = import_routes(tmp_path)
+    assert (drive.name, drive.type, drive.town) == ("leaderboard/b_7/FreeDrive", "FreeDrive", "T")
+    quarter = pytest.approx(-math.pi / 2)
+    assert [(pose.x, pose.y, pose.yaw) for pose in drive.route] == [(0, -10, 0), (50, -10, quarter), (50, -40, quarter)]
+    (tmp_path / "b.xml").rename(tmp_path / "meine Straße (2).xml")
+    assert [member.name for member in import_routes(tmp_path)] == ["leaderboard/meine_Stra_e__2__7/FreeDrive"]
+    (tmp_path / "meine Straße (2).xml").unlink()
+    (tmp_path / "b.xml").write_text(text.format('<scenario name="a" type="Accident"/>'))
+    with pytest.raises(FormatError, match=r"b\.xml: route 7: has scenarios of leaderboard 2\.0; .* import leaderboard"):
         import_routes(tmp_path)
 
 
@@ -368,6 +394,10 @@ def test_safebench_has_32_episodes(data_dir: Path, tmp_path: Path) -> None:
     assert [len(s.placements) for s in found] == [0] * 16 + [1] * 16
     assert found[0].route == (Pose(62.5, -5.25), Pose(162.5, -5.25))
     assert found[16].placements == (Pose(-18.5, -1.75),)
+    signals = {s.type: s.signals for s in found}
+    assert signals["VehiclePassing"] == signals["StraightObstacle"] == SignalPlan("green", "red")
+    assert signals["RightTurn"] == SignalPlan("red", "green", elsewhere="green")
+    assert signals["RedlightRunning"] == SignalPlan()  # its class's own
     save_scenarios(tmp_path / "safebench.yaml", found)
     assert load_scenarios(tmp_path / "safebench.yaml") == found
 
@@ -393,9 +423,9 @@ def test_routes_that_no_list_of_frea_names_come_in_too(data_dir: Path, tmp_path:
     (tmp_path / "scenario_type").mkdir()
     entries = [{"data_id": k, "scenario_id": 9, "route_id": k, "parameters": None} for k in range(28)]
     (tmp_path / "scenario_type" / "all.json").write_text(json.dumps(entries))
-    left_out: list[str] = []
-    assert len({s.route for s in import_routes(tmp_path, omissions=left_out)}) == 28
-    assert left_out == []
+    report = ImportReport("folder")
+    assert len({s.route for s in import_routes(tmp_path, report=report)}) == 28
+    assert (report.doubts, report.omissions) == ({}, {})
 
 
 @pytest.mark.data
@@ -440,7 +470,7 @@ def test_safebench_actors_stand_where_its_classes_put_them(data_dir: Path, carla
     assert poses("RightTurn/00") == [(-14.5, -5.2, 0.0)]
 
 
-def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> None:
+def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path, ssad_home: Path) -> None:
     flat = make(tmp_path / "flat")
     inside = tmp_path / "SafeBench" / "safebench" / "scenario"
     (inside / "config").mkdir(parents=True)
@@ -453,19 +483,26 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
         for k, (number, route, told) in enumerate(rows)
     ]
     (inside / "config" / "scenario_type" / "standard.json").write_text(json.dumps(entries))
-    left_out: list[str] = []
-    found = import_routes(tmp_path / "SafeBench", omissions=left_out)
+    report = ImportReport("folder")
+    found = import_routes(tmp_path / "SafeBench", report=report)
     assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
-    assert [line.rpartition("/")[2] for line in left_out] == [
-        "standard.json: entry 0: unknown scenario_id 0; known: 1 to 9",
-        "standard.json: entry 2: parameters are read in lists human and random only; set them to null",
-        "scenario_05_route_04.xml: no such route file; standard.json asks for it",
+    assert report.lines()[0] == "SafeBench: 2 of 3 entries of standard.json"
+    done = ssad("import", "routes", tmp_path / "SafeBench", "--name", "doubtful", "--strict")
+    assert done.returncode == 2
+    assert "an entry is left out: unknown scenario_id 0; known: 1 to 9: standard.json, entry 0, and 2" in done.stderr
+    assert not list(ssad_home.rglob("doubtful*"))
+    assert [line.replace(str(inside), "") for line in report.lines()[1:]] == [
+        "doubtful: an entry is left out: unknown scenario_id 0; known: 1 to 9: standard.json, entry 0",
+        "doubtful: an entry is left out: parameters are read in lists human and random only; set them to null:"
+        " standard.json, entry 2",
+        "doubtful: a route is left out: /scenario_data/route/scenario_05_routes/scenario_05_route_04.xml: no such route"
+        " file; standard.json asks for it",
     ]
     with pytest.raises(FormatError, match="unknown scenario_id 0"):
         import_routes(tmp_path / "SafeBench")
     (inside / "scenario_data" / "route" / "scenario_05_routes" / "scenario_05_route_03.xml").write_text("<routes/>")
     with pytest.raises(FormatError, match="none of its routes can be read; the first: "):
-        import_routes(tmp_path / "SafeBench", omissions=[])
+        import_routes(tmp_path / "SafeBench", report=ImportReport("folder"))
 
 
 def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_stands_for(tmp_path: Path) -> None:
@@ -478,17 +515,21 @@ def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_sta
     ]
     (lists / "human.json").write_text(json.dumps(rows))
     (lists / "advsim.json").write_text(json.dumps([row | {"parameters": "5.npy"} for row in rows]))
-    (plain,) = import_routes(folder, omissions=[])
+    report = ImportReport("folder")
+    (plain,) = import_routes(folder, report=report)
     assert plain.parameters == {}
-    left_out: list[str] = []
-    found = import_routes(lists / "human.json", omissions=left_out)
+    assert {name for names in report.omissions.values() for name in names} == {"advsim.json", "human.json"}
+    report = ImportReport("list")
+    found = import_routes(lists / "human.json", report=report)
     assert [s.parameters for s in found] == [
         {"speed": 8.0, "trigger_distance": 31.0},
         {"speed": 12.5, "trigger_distance": 39.0},
     ]
     assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
-    assert "entry 2: RedlightRunning: parameter trigger_distance: 99 is outside" in left_out[0]
-    assert ["parameters should be the numbers speed, trigger_distance" in line for line in left_out[1:]] == [True] * 3
+    reasons = list(report.doubts)
+    assert "RedlightRunning: parameter trigger_distance: 99 is outside" in reasons[0]
+    assert report.doubts[reasons[0]] == ["human.json, entry 2"]
+    assert ["parameters should be the numbers speed, trigger_distance" in line for line in reasons[1:]] == [True] * 3
 
 
 @pytest.mark.parametrize("number", range(1, 9))

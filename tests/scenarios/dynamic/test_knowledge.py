@@ -25,6 +25,7 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
+from ssad.interchange.scenario_parts import plan_of
 from ssad.scenarios.dynamic import (
     PRECRASH,
     SCENARIOS,
@@ -228,31 +229,39 @@ def test_signals_of_the_ego_and_of_the_others(crossroads: LaneGraph, routes: Any
     assert set(forced_signals(real, routes.straight, green_plan, whole_town=True).values()) == {green}
 
 
-def test_red_is_forced_only_where_the_ego_turns_to_the_near_side() -> None:
-    """A route of Twinford that goes straight on at one junction and turns right at the next."""
-    graph = load_town("Twinford")
+def two_junctions(graph: LaneGraph, *, first_turns: bool) -> Route:
+    """A route straight on at one junction, or turning right there, and right at the next."""
     turns = {}
     for lane in np.flatnonzero((graph.junction >= 0) & (graph.kind == LaneType.DRIVING)).tolist():
         part = graph.points(lane)
         turns[lane] = float(wrap_angle(graph.yaw[part.stop - 1] - graph.yaw[part.start]))
-    route = next(
+    return next(
         candidate
-        for straight, angle in turns.items()
-        if abs(angle) < 0.2
-        for between in graph.successors(straight).tolist()
+        for first, angle in turns.items()
+        if (angle < -1.0 if first_turns else abs(angle) < 0.2)
+        for between in graph.successors(first).tolist()
         for right in graph.successors(between).tolist()
-        if turns.get(right, 0.0) < -1.0 and graph.junction[right] != graph.junction[straight]
+        if turns.get(right, 0.0) < -1.0 and graph.junction[right] != graph.junction[first]
         for candidate in [
             route_along(
                 graph,
                 [
-                    Pose(*graph.at(int(graph.predecessors(straight)[0]), 5.0)[:3]),
+                    Pose(*graph.at(int(graph.predecessors(first)[0]), 5.0)[:3]),
                     Pose(*graph.at(between, 0.5 * float(graph.length[between]))[:3]),
                     Pose(*graph.at(int(graph.successors(right)[0]), 5.0)[:3]),
                 ],
             )
         ]
     )
+
+
+def forced_junctions(graph: LaneGraph, route: Route, plan: SignalPlan, trigger: Pose | None = None) -> set[int]:
+    return {int(graph.signal_junction[signal]) for signal in forced_signals(graph, route, plan, trigger=trigger)}
+
+
+def test_red_is_forced_only_where_the_ego_turns_to_the_near_side() -> None:
+    graph = load_town("Twinford")
+    route = two_junctions(graph, first_turns=False)
     on_route = np.unique(graph.junction[route.lane[route.lane >= 0]])
     turned_at = near_side_turns(graph, route)
     assert len(turned_at) == 1
@@ -263,9 +272,27 @@ def test_red_is_forced_only_where_the_ego_turns_to_the_near_side() -> None:
     assert sorted(set(states.values())) == sorted({SignalState.RED, SignalState.GREEN})
     mirrored = replace(graph, left_hand=np.array([True]))
     assert near_side_turns(mirrored, route) == set()
-    assert {int(graph.signal_junction[s]) for s in forced_signals(mirrored, route, plan)} == set(on_route.tolist()) - {
-        -1
-    }
+    assert forced_junctions(mirrored, route, plan) == set(on_route.tolist()) - {-1}
+    elsewhere = forced_signals(graph, route, replace(plan, elsewhere="green"))
+    assert elsewhere.items() >= states.items()
+    added = {signal: state for signal, state in elsewhere.items() if signal not in states}
+    assert {int(graph.signal_junction[signal]) for signal in added} == set(on_route.tolist()) - {-1} - turned_at
+    assert set(added.values()) == {SignalState.RED, SignalState.GREEN}
+    assert plan_of(graph, route, elsewhere, 60.0) == replace(plan, elsewhere="green")
+
+
+def test_of_two_turns_red_is_forced_at_the_one_that_follows_the_trigger() -> None:
+    graph = load_town("Twinford")
+    route = two_junctions(graph, first_turns=True)
+    junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
+    first, second = list(dict.fromkeys(junction[junction >= 0].tolist()))
+    plan = SignalPlan("red", "green")
+    assert forced_junctions(graph, route, plan) == {first, second}
+    last_of_first = int(np.flatnonzero(junction == first)[-1])
+    before, between = Pose(*route.xy[0].tolist()), Pose(*route.xy[last_of_first + 3].tolist())
+    assert forced_junctions(graph, route, plan, before) == {first}
+    assert forced_junctions(graph, route, plan, between) == {second}
+    assert forced_junctions(graph, route, plan, Pose(*route.xy[-1].tolist())) == {first, second}
 
 
 def test_a_town_that_forbids_turns_on_red_has_no_right_turn_on_red() -> None:

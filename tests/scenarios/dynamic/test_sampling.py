@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError, RouteError
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import Actor, Episode, Phase, PhaseTrigger, Pose, Route, Scenario
+from ssad.core.types import Actor, Body, Episode, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic import (
     PRECRASH,
     Parameter,
@@ -79,7 +79,14 @@ NOMINAL = {
 
 
 # fields that came later: at their defaults they change nothing
-LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None}
+LATER = {"trajectory": (), "contact": "end", "policy": "", "draw": None, "lateral": (), "lateral_targets": ()}
+LATER |= {"acceleration": None, "jerk": None, "shape": "linear", "duration": None, "distance": None, "arrival": None}
+LATER |= {"name": "", "reference": "", "factor": False, "continuous": False, "anytime": False, "agent": "", "phase": ""}
+LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_space": False, "measure": "straight"}
+LATER |= {"all": (), "any": ()}
+LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
+LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
+LATER |= {"elsewhere": "program"}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

@@ -16,6 +16,7 @@ from ssad.core.types import (
     Actor,
     Body,
     EpisodeLimits,
+    LateralPhase,
     Phase,
     PhaseTrigger,
     Pose,
@@ -40,6 +41,7 @@ from ssad.world.models import MODELS
 
 number = st.floats(-1.0e5, 1.0e5, allow_subnormal=False)
 positive = st.floats(1e-3, 1.0e4)
+jerks = st.floats(1e-3, 100.0)
 poses = st.builds(Pose, number, number, number)
 light = st.sampled_from(["program", "off", "red", "green"])
 texts = st.text(max_size=20).filter(lambda t: all(c.isprintable() for c in t))
@@ -56,12 +58,21 @@ def scenarios(draw: st.DrawFn) -> Scenario:
             positive,
             st.just(0),
         )
-        phase = st.builds(Phase, st.floats(0.0, 1.0).map(float), condition)
+        groups = st.lists(condition | st.builds(PhaseTrigger, all=st.tuples(condition, condition)), max_size=3).map(
+            tuple
+        )
+        paced = st.fixed_dictionaries({}, optional={"acceleration": positive.map(lambda a: min(a, 9.0)), "jerk": jerks})
+        phase = st.tuples(st.builds(Phase, st.floats(0.0, 1.0).map(float), condition), paced).map(
+            lambda pair: replace(pair[0], **pair[1])
+        )
         body = st.sampled_from([m for m in MODELS if MODELS[m].max_speed >= 1.0])
         path = st.lists(st.tuples(number, number), min_size=2, max_size=4).map(tuple)
+        swerve = st.builds(LateralPhase, st.integers(-3, 3), st.floats(-5.0, 5.0), st.builds(PhaseTrigger, any=groups))
         size = st.builds(Body, length=st.none() | st.floats(0.5, 20.0), brake_build_up=st.none() | st.floats(0.0, 1.0))
-        phases = st.lists(phase, max_size=3).map(tuple)
-        actor = st.builds(Actor, texts, body, poses, phases, path, body=size)
+        phases, lateral = (st.lists(kind, max_size=2).map(tuple) for kind in (phase, swerve))
+        actor = st.builds(
+            Actor, texts, body, poses, phases, path, body=size, speed=st.floats(0.0, 1.0), lateral=lateral
+        )
         actors = tuple(draw(st.lists(actor, min_size=1, max_size=3)))
     box = parameter_box(kind)
     chosen = draw(st.sets(st.sampled_from(sorted(box))))
@@ -169,7 +180,11 @@ BAD: list[tuple[dict[str, Any], int, str]] = [
         'a valid string, not {"long": ["aaaaaaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbbbbbb",...',
     ),
     ({"route": "[{x: 0, y: 0}]"}, 4, "at least two key points"),
-    ({"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"}, 4, 'route[1].x: should be a valid number, not "nine"'),
+    (
+        {"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"},
+        4,
+        "route[1].x: expression 'nine': there is no parameter 'nine'; closest: ",
+    ),
     ({"route": "[{x: 0, y: 0}, {x: '9', y: 0}]"}, 4, "route[1].x: should be a valid number"),
     ({"route": "[{x: 0, y: 0}, {x: 9, y: 0, z: 1}]"}, 4, "route[1].z: unknown key; known: x, y, yaw"),
     ({"route": "[{x: 0, y: 0}, {x: 9}]"}, 4, "key 'y' is missing"),
@@ -410,7 +425,7 @@ BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (waiting(actor=0), waiting(actor=1), "phases[0].when.actor: there are actors 0 to 0"),
     (waiting(actor=0), waiting(actor=-1), "phases[0].when.actor: there are actors 0 to 0"),
     ({"type": "Custom"}, {"type": "Nothing"}, "type: "),
-    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+/"),
+    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+=/"),
     ({"parameters": {"speed": 17}}, {"parameters": {"speed": 17.01}}, "parameters.speed: 17.01 is outside 7 to 17 m/s"),
     (actor(), actor() | {"type": "RightTurn"}, "actors: only type Custom takes actors; RightTurn makes its own"),
 ]

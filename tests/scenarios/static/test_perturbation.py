@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,6 +34,14 @@ from tests.scenarios.static.digital.toy_detector import ToyDetector, toy_scene
 
 OWN = ["Haze", "Smear", "Mirror"]
 NAMES = [*sorted(registered_names()), *(f"helpers.own_perturbations:{name}" for name in OWN)]
+FEW_QUERIES = {
+    "cw-min": "?rounds=1&steps=3",
+    "nes": "?steps=2&samples=2",
+    "spsa": "?steps=2&samples=2",
+    "square": "?queries=10",
+}
+"""Options of attacks whose defaults take most of the time of this file and change nothing that it asserts."""
+SIZE = 160
 HEIGHT, WIDTH = toy_scene(1)[0].shape[-2:]
 CAMERA = Camera.typical(WIDTH, HEIGHT, channel="CAM_FRONT")
 STEPS = 2
@@ -94,7 +103,7 @@ def clean_images() -> list[Any]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_acts_in_the_loop(name: str) -> None:
-    (perturbation,) = parse_perturbation(name).at([5])
+    (perturbation,) = parse_perturbation(name + FEW_QUERIES.get(name, "")).at([5])
     assert perturbation.family
     assert isinstance(perturbation.version(), str)
     clean, perturbed = clean_images(), drive(perturbation)
@@ -129,7 +138,7 @@ def test_it_acts_on_recorded_scenes(tiny_set: Path, tmp_path: Path) -> None:
     clean = [read_image(tiny_set / frame.filename) for frame in frames]
     acted = []
     for name in NAMES:
-        (perturbation,) = parse_perturbation(name).at([5])
+        (perturbation,) = parse_perturbation(name + FEW_QUERIES.get(name, "")).at([5])
         victim = MonitoredDetector(ToyDetector(), "toy")
         if perturbation.needs_target or name == "night":
             with pytest.raises(ConfigError, match="does not act on recorded scenes"):
@@ -150,43 +159,37 @@ def test_it_acts_on_recorded_scenes(tiny_set: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def targets(shared: Shared) -> dict[str, Path]:
-    """A few images of every target of a shipped texture."""
+def target_images(shared: Shared) -> Callable[[str], Path]:
+    """Give the recording of an image of a target, which is made when it is first asked for."""
 
-    def make(out: Path) -> None:
-        for target in all_targets():
-            parsed = parse_target(target)
-            mode = "drive" if isinstance(parsed, TargetCar) else "orbit"
-            folder = out / target.replace(":", "-")
-            record_target_images(
-                TargetRecording(
-                    folder, (("Twinford", 1),), (), size=320, behind=8.0, target=parsed, mode=mode, distances=(6.0,)
-                ),
-                workers=0,
+    def record(target: str) -> Path:
+        parsed = parse_target(target)
+        mode = "drive" if isinstance(parsed, TargetCar) else "orbit"
+
+        def make(out: Path) -> None:
+            recording = TargetRecording(
+                out, (("Twinford", 1),), (), size=SIZE, behind=8.0, target=parsed, mode=mode, distances=(6.0,)
             )
+            record_target_images(recording, workers=0)
 
-    folder = shared("perturbation-targets", make)
-    return {target: folder / target.replace(":", "-") for target in all_targets()}
+        return shared(f"perturbation-{target.replace(':', '-')}", make)
 
-
-def all_targets() -> list[str]:
-    made = [parse_perturbation(name).make(3) for name in registered_names()]
-    return sorted({one.target for one in made if one.needs_target})
+    return record
 
 
 @pytest.mark.slow
-def test_every_texture_and_light_acts_on_its_recorded_target(targets: dict[str, Path]) -> None:
+def test_every_texture_and_light_acts_on_its_recorded_target(target_images: Callable[[str], Path]) -> None:
     for name in registered_names():
         (perturbation,) = parse_perturbation(name).at([3])
         if perturbation.needs_target:
-            on_target(perturbation, targets[perturbation.target])
+            on_target(perturbation, target_images(perturbation.target))
 
 
 @pytest.mark.parametrize("name", ["grey", "das-yolov5n-twinford", "grey-sign", "flashlight", "shadow", "night"])
-def test_it_acts_on_a_recorded_target(name: str, targets: dict[str, Path]) -> None:
+def test_it_acts_on_a_recorded_target(name: str, target_images: Callable[[str], Path]) -> None:
     (perturbation,) = parse_perturbation(name).at([3])
     target = perturbation.target or "sedan"
-    change = on_target(perturbation, targets[target])
+    change = on_target(perturbation, target_images(target))
     assert change > 0.0 or name == "shadow"  # whose card, drawn at random, may miss the sun of this image
 
 
@@ -197,7 +200,7 @@ def on_target(perturbation: Perturbation, folder: Path) -> float:
     clean = list(images.clean())
     assert [drive for drive, _, _ in changed] == [drive for drive, _, _ in clean]
     for _, image, truth in changed:
-        assert image.shape == (1, 3, 320, 320)
+        assert image.shape == (1, 3, SIZE, SIZE)
         assert len(truth.label) >= 1
     return float((changed[0][1] - clean[0][1]).abs().mean()) * 255
 

@@ -172,7 +172,7 @@ def test_no_lane_change_begins_before_a_fast_car(behind: float) -> None:
         assert ahead < -10.0
 
 
-@pytest.mark.parametrize("ends", [100.0, 150.0, 300.0])
+@pytest.mark.parametrize("ends", [100.0, 170.0, 300.0])
 def test_it_is_back_in_its_lane_where_the_other_ends(ends: float) -> None:
     """Whether or not there was room to pass: nobody drives on beyond the end of a lane."""
     slow = steady("slow", 60.0, 0.0, 3.0)
@@ -263,4 +263,18 @@ def test_a_pass_on_the_oncoming_lane_is_broken_off_when_somebody_comes(back: boo
     assert y[before].max() > 0.5  # it had begun
     beside = before & (np.abs(x - 80.0) < 4.0)
     assert beside.any() == (not back)
+    assert ENDS[found["end"][0]] == "complete"
+
+
+def test_a_creeping_leader_is_passed_even_where_the_ego_has_closed_up() -> None:
+    """The lane beside begins to be usable only when the ego follows at its small distance."""
+    leader = steady("leader", 25.0, 0.0, 2.0)
+    follower = replace(autopilot(16.0), speed=2.0)
+    beside = steady("beside", 17.0, 3.5, 2.0)  # holds the lane beside for a while, then speeds away
+    beside = replace(beside, phases=(Phase(2.0), Phase(12.0, PhaseTrigger("time", value=12.0))))
+    found = drive(episode(follower, leader, beside, limits=LONG), {"Straight": two_lanes()})
+    x, y, speed = found["pose"][:, 0, 0], found["pose"][:, 0, 1], found["speed"][:, 0]
+    assert np.abs(y[:115]).max() < 0.5
+    assert speed[100:115] == pytest.approx(2.0, abs=0.15)
+    assert (x > found["pose"][:, 1, 0])[-1]
     assert ENDS[found["end"][0]] == "complete"

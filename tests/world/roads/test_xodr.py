@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,7 @@ def ends(graph: LaneGraph, row: int) -> np.ndarray:
         '<paramPoly3 aU="0" bU="100" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0" pRange="normalized"/>',
         '<paramPoly3 aU="0" bU="100" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0"/>',
         '<paramPoly3 aU="0" bU="1" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0" pRange="arcLength"/>',
+        '<paramPoly3 aU="0" bU="1" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0" pRange=" arclength"/>',
         '<poly3 a="0" b="0" c="0" d="0"/>',
     ],
 )
@@ -105,8 +107,19 @@ def test_a_spiral_of_constant_curvature_is_an_arc(tmp_path: Path) -> None:
     assert arc.length[rows(arc)[1, -1]] == pytest.approx(101.75, abs=0.01)
 
 
-def test_a_default_namespace(tmp_path: Path) -> None:
-    assert town(tmp_path, road(), attributes='xmlns="http://www.opendrive.org"').lane_count == 2
+@pytest.mark.parametrize("place", ["root", "prefix", "road"])
+def test_a_namespace(tmp_path: Path, place: str) -> None:
+    """Elements of another namespace within `userData` are none of the map's."""
+    other = '<userData><lane xmlns="http://other" id="5"/></userData>'
+    text = f'<OpenDRIVE><header revMajor="1" revMinor="7"/>{road(tail=other)}</OpenDRIVE>'
+    if place == "prefix":
+        text = re.sub(r"<(/?)(?!lane xmlns)", r"<\1odr:", text)
+        text = text.replace("<odr:OpenDRIVE", '<odr:OpenDRIVE xmlns:odr="http://www.opendrive.org"')
+    else:
+        tag = "<OpenDRIVE" if place == "root" else "<road"
+        text = text.replace(tag, f'{tag} xmlns="http://www.opendrive.org"', 1)
+    (tmp_path / "map.xodr").write_text(text, encoding="utf-8")
+    assert bake(tmp_path / "map.xodr").lane_count == 2
 
 
 def test_left_hand_traffic(tmp_path: Path) -> None:
@@ -163,22 +176,53 @@ def test_a_link_to_a_road_that_is_missing_ends_there(tmp_path: Path) -> None:
     assert sum("road 1 to 77" in line for line in report.lines()) == 1
 
 
+def test_junctions_of_which_parts_are_missing(tmp_path: Path) -> None:
+    """An excerpt: what is there is linked, and what is not is named."""
+    report = ImportReport("map")
+    between = PREDECESSOR + '<successor elementType="road" elementId="44" contactPoint="start"/>'
+    through = section("", lane(-1, '<predecessor id="-1"/><successor id="-1"/>'))
+    connection = '<connection id="0" incomingRoad="{}" connectingRoad="{}" contactPoint="{}">{}</connection>'
+    lane_link = '<laneLink from="{0}" to="-1"/>'
+    junction = (
+        connection.format(1, 2, "start", lane_link.format(-1))
+        + connection.format(44, 2, "end", lane_link.format(1))
+        + connection.format(1, 55, "start", lane_link.format(-1))
+    )
+    graph = town(
+        tmp_path,
+        road(1, link='<successor elementType="junction" elementId="9"/>'),
+        road(2, x=100.0, length=20, junction=9, link=between, sections=through),
+        road(3, y=50.0, junction=8, link='<successor elementType="junction" elementId="7"/>'),
+        f'<junction id="9">{junction}</junction>',
+        report=report,
+    )
+    assert links(graph) == {((1, -1), (2, -1))}
+    assert report.doubts == {
+        "a road is linked to a road that the map lacks; it ends there": ["road 2 to 44"],
+        "a junction connects a road that the map lacks": ["junction 9, road 44", "junction 9, road 55"],
+        "a road is linked to a junction that the map lacks; it ends there": ["road 3 to 7"],
+        "a road belongs to a junction that the map lacks": ["road 3"],
+    }
+
+
 SUCCESSOR = '<successor elementType="road" elementId="2" contactPoint="start"/>'
 PREDECESSOR = '<predecessor elementType="road" elementId="1" contactPoint="end"/>'
 
 
-@pytest.mark.parametrize("side", ["first", "second", "both", "one road alone"])
+@pytest.mark.parametrize(
+    "side", ["first", "second", "both", "one road alone", "the road of one, the lanes of the other"]
+)
 def test_links_on_either_side_count(tmp_path: Path, side: str) -> None:
     first = section(lane(1, '<successor id="1"/>'), lane(-1, '<successor id="-1"/>'))
     second = section(lane(1, '<predecessor id="1"/>'), lane(-1, '<predecessor id="-1"/>'))
     report = ImportReport("map")
     graph = town(
         tmp_path,
-        road(1, link=SUCCESSOR, sections=section() if side == "second" else first),
+        road(1, link=SUCCESSOR, sections=section() if side.startswith(("second", "the road")) else first),
         road(
             2,
             x=100.0,
-            link="" if side == "one road alone" else PREDECESSOR,
+            link="" if side.startswith(("one road", "the road")) else PREDECESSOR,
             sections=section() if side == "first" else second,
         ),
         report=report,
@@ -219,6 +263,44 @@ def test_a_header_tells_the_offset_to_its_projection(tmp_path: Path) -> None:
     graph = bake(path)
     assert graph.origin.tolist() == [500000.0, 100.0]
     assert graph.xy[:, 0].max() == pytest.approx(100.0, abs=0.01)
+
+
+def test_a_direct_junction_where_roads_part_and_join(tmp_path: Path) -> None:
+    """Lanes of both directions, several lanes a connection, and a ramp that comes from the other side."""
+    to_junction = '<{} elementType="junction" elementId="9"/>'
+    connections = "".join(
+        f'<connection id="{source}{target}" incomingRoad="{source}" linkedRoad="{target}" contactPoint="{contact}">'
+        + "".join(f'<laneLink from="{first}" to="{second}"/>' for first, second in lane_pairs)
+        + "</connection>"
+        for source, target, contact, lane_pairs in (
+            (1, 2, "start", ((-1, -1), (-2, -2), (1, 1))),
+            (1, 3, "start", ((-3, -1),)),
+            (4, 1, "end", ((-1, 2),)),
+        )
+    )
+    graph = town(
+        tmp_path,
+        road(1, length=50, link=to_junction.format("successor"), sections=section(lanes(1, 2), lanes(-1, -2, -3))),
+        road(2, x=50.0, length=50, link=to_junction.format("predecessor"), sections=section(right=lanes(-1, -2))),
+        road(3, x=50.0, y=-7, length=50, link=to_junction.format("predecessor"), sections=section("", lanes(-1))),
+        road(
+            4,
+            x=100.0,
+            y=3.5,
+            heading=np.pi,
+            length=50,
+            link=to_junction.format("successor"),
+            sections=section("", lanes(-1)),
+        ),
+        f'<junction id="9" type="direct">{connections}</junction>',
+    )
+    assert links(graph) == {
+        ((1, -1), (2, -1)),
+        ((1, -2), (2, -2)),
+        ((2, 1), (1, 1)),
+        ((1, -3), (3, -1)),
+        ((4, -1), (1, 2)),
+    }
 
 
 def test_a_direct_junction(tmp_path: Path) -> None:

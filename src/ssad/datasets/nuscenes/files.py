@@ -9,11 +9,12 @@ import numpy.typing as npt
 
 from ssad.core.image_files import ImageFile, read_image_file
 from ssad.core.images import annotated_pixels
-from ssad.core.types import U8
+from ssad.core.types import F32, U8
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.tables import nuscenes_path
 from ssad.datasets.point_files import read_points
 
-__all__ = ["POINT_BYTES", "points_bytes", "read_frame_file", "read_frame_image", "read_points"]
+__all__ = ["POINT_BYTES", "points_bytes", "read_frame_file", "read_frame_image", "read_frame_points", "read_points"]
 
 POINT_BYTES = 20
 
@@ -27,14 +28,25 @@ def read_frame_image(root: Path, frame: SensorFrame) -> U8:
 
     Raises:
         FormatError: The file cannot be read, or its size contradicts the tables.
+        StoreError: The file leads out of the root.
     """
     return read_frame_file(root, frame)[1]
 
 
 def read_frame_file(root: Path, frame: SensorFrame) -> tuple[ImageFile, U8]:
     """The same with the content of the file, whose format a shifted image takes over."""
-    image_file = read_image_file(root / frame.filename)
+    image_file = read_image_file(nuscenes_path(root, frame.filename))
     return image_file, annotated_pixels(image_file, width=frame.width, height=frame.height)
+
+
+def read_frame_points(root: Path, frame: SensorFrame) -> F32:
+    """Read the points [P, 5] of a LiDAR sweep: x, y, z, intensity and ring.
+
+    Raises:
+        FormatError: The file cannot be read.
+        StoreError: The file leads out of the root.
+    """
+    return read_points(nuscenes_path(root, frame.filename))
 
 
 def points_bytes(points: npt.ArrayLike) -> bytes:

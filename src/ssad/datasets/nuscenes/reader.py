@@ -7,6 +7,7 @@ scene. Scenes are objects of `ssad.datasets.nuscenes.scene`; `ssad.datasets.nusc
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -17,6 +18,7 @@ import numpy as np
 from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.folders import is_file_name
+from ssad.core.import_report import ImportReport
 from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.index import Index, open_index
@@ -42,9 +44,12 @@ from ssad.datasets.nuscenes.schema import (
     Sensor,
     TableRecord,
 )
-from ssad.datasets.nuscenes.tables import table_path
+from ssad.datasets.nuscenes.tables import nuscenes_path, table_path
 
 R = TypeVar("R", bound=TableRecord)
+
+
+UNREAD_FOLDERS = ("can_bus", "lidarseg", "maps", "panoptic")
 
 
 class NuScenes:
@@ -57,12 +62,14 @@ class NuScenes:
     Raises:
         ConfigError: The version does not exist, or several exist and none is named.
         FormatError: The tables are broken.
-        StoreError: The index of a large version cannot be written.
+        StoreError: A folder or a table leads out of the root (`ssad.core.folders.data_path`), or the index of a large
+            version cannot be written.
     """
 
     def __init__(self, root: Path, version: str | None = None) -> None:
         self.root = Path(root)
         self.version = _choose_version(self.root, version)
+        _check_links(self.root)
         self._index: Index = open_index(self.root, self.version)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -77,6 +84,18 @@ class NuScenes:
     def close(self) -> None:
         """Close the index file; a later call opens it again."""
         self._index.close()
+
+    def report(self) -> ImportReport:
+        """Return a report on the folder: its scenes, and tables and folders that are not read."""
+        report = ImportReport(str(self.root))
+        report.contents.append(f"nuScenes schema {self.version}: {len(self.scenes())} scenes")
+        for path in sorted((self.root / self.version).glob("*.json")):
+            if path.stem not in TABLES:
+                report.omit("tables that are not read", f"{self.version}/{path.name}")
+        for path in sorted(self.root.iterdir()):
+            if path.name in UNREAD_FOLDERS:
+                report.omit("folders that are not read", path.name)
+        return report
 
     def scenes(self) -> list[Scene]:
         """Return all scenes, in table order."""
@@ -308,6 +327,17 @@ class NuScenes:
             token = rows[int(zero_rows[0])].token
             raise FormatError(f"{self._path(SampleAnnotation)}: '{token}': the rotation has length zero")
         return rotation
+
+
+def _check_links(root: Path) -> None:
+    """Raise StoreError if a folder of sensors leads out of the root: before any of its files is read."""
+    for name in ("samples", "sweeps"):
+        folder = nuscenes_path(root, name)
+        if folder.is_dir():
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.is_symlink():
+                        nuscenes_path(root, f"{name}/{entry.name}")
 
 
 def _choose_version(root: Path, version: str | None) -> str:

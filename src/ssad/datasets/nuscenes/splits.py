@@ -28,7 +28,7 @@ def own_splits(root: Path, version: str) -> dict[str, tuple[str, ...]]:
     Raises:
         FormatError: The file is broken.
     """
-    path = root / version / "splits.json"
+    path = table_path(root, version, "splits")
     if not path.is_file():
         return {}
     content = safeio.read_json(path)

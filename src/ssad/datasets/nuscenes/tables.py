@@ -8,8 +8,11 @@ from typing import TypeVar
 
 import msgspec
 
-from ssad.core.errors import FormatError
+from ssad.core.errors import FormatError, StoreError
+from ssad.core.folders import data_path
+from ssad.core.safeio import read_json
 
+SHIFT_IDENTITY = "manifest/identity.json"  # of a shifted root
 BLOCK = 4 << 20
 LIMIT = 16 * BLOCK  # largest undecoded text, bytes: no record is longer
 _SPACE = b" \t\r\n"
@@ -113,5 +116,34 @@ def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line
 
 
 def table_path(root: Path, version: str, name: str) -> Path:
-    """Return the file of a table, such as ROOT/v1.0-mini/sample.json."""
-    return root / version / f"{name}.json"
+    """Return the file of a table, such as ROOT/v1.0-mini/sample.json. StoreError if it leads out of the root."""
+    return nuscenes_path(root, f"{version}/{name}.json")
+
+
+def nuscenes_path(root: Path, relative: str) -> Path:
+    """Return the path of a file or folder of a nuScenes root.
+
+    Links of a shifted root (nuScenes-N) may lead to the file of the same name of the dataset that it names as its
+    source, but to nothing else there.
+
+    Raises:
+        StoreError: The path leads out of the root, by its name or by a symbolic link (`ssad.core.folders.data_path`).
+    """
+    try:
+        return data_path(root, relative)
+    except StoreError:
+        source = _source_root(root)
+        if source is None:
+            raise
+        return data_path(root, relative, source=source)
+
+
+def _source_root(root: Path) -> Path | None:
+    """Return the dataset that a shifted root was made of; None for any other folder."""
+    path = root / SHIFT_IDENTITY
+    if path.is_symlink() or not path.is_file():
+        return None
+    identity = read_json(path)
+    source = identity.get("source") if isinstance(identity, dict) else None
+    text = source.get("root") if isinstance(source, dict) else None
+    return Path(text) if isinstance(text, str) and Path(text).is_absolute() and "\0" not in text else None

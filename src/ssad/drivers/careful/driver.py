@@ -12,12 +12,13 @@ from ssad.core.driving import Observation
 from ssad.core.types import F32, F64, Bool, Controller, Episode, SignalState
 from ssad.drivers.careful.encounter import Encounter
 from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, initial_reaction, react
-from ssad.drivers.careful.sight import Path, encounters
+from ssad.drivers.careful.sight import BEYOND, Path, encounters
 from ssad.drivers.careful.steering import pursue
 from ssad.world.models import agent_model
 
 STEP = 0.1  # s, of the world
 REACH = 100.0  # m that it sees
+FAST = 27.0  # m/s: who aims for more than any town's limit sees as far as it needs to stop at EASY
 BEND = 2.5  # m/s^2, lateral acceleration in bends
 EASY = 2.0  # m/s^2, braking before bends and for red lights
 PULL = 2.0  # m/s^2, acceleration to its target speed
@@ -98,9 +99,11 @@ class Careful:
         scenes, agent_count = view.scene, view.readings["truth"].kind.shape[1]
         if agent_count > self._moved.shape[1]:  # the world has room for more agents than these episodes have
             self._forget(agent_count)
-        path, half_size = Path(view.route), self._half[scenes]
+        target_speed = np.asarray(view.target_speed, np.float64)
+        reach = np.where(target_speed > FAST, target_speed * target_speed / (2.0 * EASY), REACH)
+        path, half_size = Path(view.route, BEYOND + reach - REACH), self._half[scenes]
         encounter, visible, lateral_travel = encounters(
-            view, path, half=half_size, reach=REACH, moved=self._moved[scenes], dt=STEP
+            view, path, half=half_size, reach=reach, moved=self._moved[scenes], dt=STEP
         )
         memory = Reaction(np.where(visible, self._memory.since[scenes], -1.0), self._memory.brake[scenes])
         # hidden agents are moved far behind, where no model reacts to them
@@ -114,7 +117,6 @@ class Careful:
         speed = np.asarray(view.speed, np.float64)
         is_new = np.isnan(self._cruise[scenes])
         self._cruise[scenes] = np.where(is_new, speed, self._cruise[scenes])
-        target_speed = np.asarray(view.target_speed, np.float64)
         target = np.maximum(self._cruise[scenes], 1.0) if self.keep_speed else target_speed
         allowed = squared_bend_speeds(view.route)
         bend_limit = bend_speed(allowed, np.arange(allowed.shape[1], dtype=np.float64))

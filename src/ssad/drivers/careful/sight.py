@@ -20,8 +20,13 @@ ALONG = np.deg2rad(30.0)  # an agent that moves at less than this angle to the p
 class Path:
     """Next metres of N routes, each in the frame of its driver, as a chain of segments."""
 
-    def __init__(self, route: npt.NDArray[np.floating]) -> None:
-        """Take the route [N, R, 2] as `Observation.route` has it; repeated points at its end are left out."""
+    def __init__(self, route: npt.NDArray[np.floating], beyond: float | F64 = BEYOND) -> None:
+        """Take the route [N, R, 2] as `Observation.route` has it; repeated points at its end are left out.
+
+        Args:
+            route: Routes of N drivers, m.
+            beyond: Straight extension after the last point, m, of all or of each [N].
+        """
         points = np.asarray(route, np.float64)
         steps = np.diff(points, axis=1)
         lengths = np.hypot(steps[..., 0], steps[..., 1])
@@ -35,7 +40,8 @@ class Path:
         extended_start = points[:, :1] - BEHIND * first_direction
         self.a = np.concatenate([extended_start, points], 1)
         self.t = np.concatenate([first_direction, directions, directions[:, -1:]], 1)
-        self.size = np.concatenate([np.full((len(points), 1), BEHIND), lengths, np.full((len(points), 1), BEYOND)], 1)
+        extension = np.broadcast_to(np.asarray(beyond, np.float64), len(points))[:, None]
+        self.size = np.concatenate([np.full((len(points), 1), BEHIND), lengths, extension], 1)
         self.s = np.concatenate([np.zeros((len(points), 1)), np.cumsum(self.size[:, :-1], 1)], 1)
 
     def project(self, points: F64) -> tuple[F64, F64, F64]:
@@ -79,7 +85,7 @@ class Path:
 
 
 def encounters(
-    view: Observation, path: Path, *, half: F64, reach: float, moved: F64, dt: float
+    view: Observation, path: Path, *, half: F64, reach: float | F64, moved: F64, dt: float
 ) -> tuple[Encounter, Bool, F64]:
     """Return all agents in line of sight as encounters of careful models.
 
@@ -90,7 +96,7 @@ def encounters(
         view: Observation of N drivers, with the sensor `truth`.
         path: Their paths.
         half: [N, 2] half length and width of their bodies, m.
-        reach: Visual range, m.
+        reach: Visual range, m, of all or of each [N].
         moved: [N, K] lateral travel of each agent towards the path so far, m.
         dt: Time since then, s.
 

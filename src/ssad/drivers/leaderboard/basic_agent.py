@@ -25,18 +25,24 @@ LANE: Final = 1.5  # m beside the plan within which a vehicle is in the way
 LOOK_AHEAD: Final = 3.0  # m to the point that it steers to, and half a metre more for each m/s
 
 
-class _Controller:
-    """PID controller with a short memory."""
+class PidController:
+    """PID controller with a short memory.
 
-    def __init__(self, gains: tuple[float, float, float]) -> None:
-        self._gains = gains
+    Args:
+        gains: Proportional, integral and derivative gain.
+        step: Time between two errors, s.
+    """
+
+    def __init__(self, gains: tuple[float, float, float], step: float = STEP) -> None:
+        self._gains, self._step = gains, step
         self._errors: list[float] = []
 
     def __call__(self, error: float) -> float:
+        """Return the command for an error."""
         self._errors = [*self._errors[1 - MEMORY :], error]
-        change = (self._errors[-1] - self._errors[-2]) / STEP if len(self._errors) > 1 else 0.0
+        change = (self._errors[-1] - self._errors[-2]) / self._step if len(self._errors) > 1 else 0.0
         proportional, integral, derivative = self._gains
-        return proportional * error + integral * sum(self._errors) * STEP + derivative * change
+        return proportional * error + integral * sum(self._errors) * self._step + derivative * change
 
 
 class BasicAgent:
@@ -70,7 +76,7 @@ class BasicAgent:
         self._ignores_vehicles = bool(options.get("ignore_vehicles", False))
         self._follows_limits = False
         self._plan: list[tuple[Waypoint, Any]] = []
-        self._steering, self._pedals = _Controller(STEERING), _Controller(PEDALS)
+        self._steering, self._pedals = PidController(STEERING), PidController(PEDALS)
 
     def set_target_speed(self, speed: float) -> None:
         """Set the target speed, km/h."""
@@ -109,6 +115,11 @@ class BasicAgent:
     ) -> None:
         """Follow a plan of waypoints and commands; without `clean_queue` after the present one."""
         self._plan = [*([] if clean_queue else self._plan), *plan]
+
+    @property
+    def plan(self) -> list[tuple[Waypoint, Any]]:
+        """What is left of the plan."""
+        return self._plan
 
     def done(self) -> bool:
         """Return whether the plan is driven."""

@@ -126,7 +126,6 @@ class Leaderboard:
         self._maps: list[str] = []
 
     def _load_agent_class(self, path: str) -> type:
-        install_stand_ins()
         spec = importlib.util.spec_from_file_location(f"leaderboard_agent_{self.version[:12]}", self.path)
         if spec is None or spec.loader is None:
             raise ConfigError(f"system 'leaderboard:{path}': expected the path of a Python file")
@@ -136,6 +135,7 @@ class Leaderboard:
         # Agents import their own modules relative to their folder.
         sys.path.insert(0, str(self.path.resolve().parent))
         try:
+            install_stand_ins()
             spec.loader.exec_module(module)
         except Exception as error:
             raise ConfigError(f"system 'leaderboard:{path}': importing it failed: {describe(error)}") from error

@@ -33,6 +33,10 @@ _TYPES: Final = {
 _LIGHTS: Final = {SignalState.RED: "Red", SignalState.YELLOW: "Yellow", SignalState.GREEN: "Green"}
 
 
+class NoServerError(ConfigError, AttributeError):
+    """A hosted agent asks for what only a CARLA server has."""
+
+
 @dataclass(frozen=True)
 class SceneActor:
     """Actor of a scene at one step, as carla.Vehicle or carla.Walker.
@@ -105,6 +109,9 @@ class SceneActor:
         """Return whether the ego is within 10 m before the stop line of a signal."""
         return bool(self.role) and self.scene.signal[1] < STOPPING
 
+    def __getattr__(self, name: str) -> Any:
+        raise NoServerError(f"carla.Actor.{name} needs a CARLA server; hosted agents read pose, speed, size and role")
+
     def _along(self, value: float) -> Any:
         yaw = self.pose[2]
         return sys.modules["carla"].Vector3D(value * math.cos(yaw), -value * math.sin(yaw), 0.0)
@@ -165,10 +172,6 @@ class HostedWorld:
         raise NoServerError(f"carla.World.{name} needs a CARLA server; hosted agents read get_actors and get_map")
 
 
-class NoServerError(ConfigError, AttributeError):
-    """A hosted agent asks for what only a CARLA server has."""
-
-
 class HostedScene:
     """Scene of one episode: what is constant, and the latest observation.
 
@@ -217,7 +220,14 @@ class HostedScene:
         return SceneActor(HERO, "vehicle.car", pose, speed, size, acceleration, self, role="hero")
 
 
-class CarlaDataProvider:
+class _Provider(type):
+    """Type of `CarlaDataProvider`: what it does not offer is refused in a line."""
+
+    def __getattr__(cls, name: str) -> Any:
+        raise NoServerError(f"{cls.__name__}.{name} has no stand-in: it needs a CARLA server")
+
+
+class CarlaDataProvider(metaclass=_Provider):
     """Access to the scene of the agent that is being asked, as in srunner.scenariomanager.carla_data_provider."""
 
     _scene: HostedScene | None = None

@@ -113,7 +113,7 @@ class Adversarial(ScenarioKind):
         systems = {name: system_version(name) for name in dict.fromkeys([*suite.systems, *suite.transfer])}
         factories = {name: generator_factory(name) for name in suite.generators}
         generators = {name: source_version(factory.__module__) for name, factory in factories.items()}
-        scenarios, towns = describe_scenarios(suite)
+        scenarios, towns = describe_scenarios(suite, [column.name for column in self.columns])
         if check:
             episodes = [
                 build_episode(scenario.scenario, cached_town(scenario.scenario.town), seed=0) for scenario in scenarios

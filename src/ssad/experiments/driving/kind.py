@@ -81,7 +81,7 @@ class Driving(ScenarioKind):
         """Look up systems, scenarios and towns; with `check`, build each scenario once."""
         check_distinct(suite, "systems", suite.systems)
         systems = {name: system_version(name) for name in suite.systems}
-        scenarios, towns = describe_scenarios(suite)
+        scenarios, towns = describe_scenarios(suite, [column.name for column in self.columns])
         simulator_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
         inputs = []
         if simulator_spec and any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):

@@ -130,7 +130,7 @@ class Gap(ScenarioKind):
             system.check()
         versions = {entry.name: entry.version for entry in suite.systems}
         versions |= {name: system_version(name) for name in suite.ceilings}
-        scenarios, towns = describe_scenarios(suite)
+        scenarios, towns = describe_scenarios(suite, [column.name for column in self.columns])
         conditions = conditions_of(suite)
         targeted = [condition for condition in conditions if condition.needs_target]
         targets: dict[tuple[str, str], int | None] = {}

@@ -101,7 +101,7 @@ class HowOften(ScenarioKind):
             ConfigError: The input is wrong, or every cell has a method that needs branches and a system without.
         """
         systems = {name: system_version(name) for name in suite.systems}
-        scenarios, towns = describe_scenarios(suite)
+        scenarios, towns = describe_scenarios(suite, [column.name for column in self.columns])
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
         cells = tuple(
             self.scenario_cell(

@@ -26,7 +26,7 @@ from ssad.datasets.nuscenes.files import read_frame_file
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
-from ssad.datasets.nuscenes.tables import BROKEN
+from ssad.datasets.nuscenes.tables import BROKEN, nuscenes_path
 from ssad.datasets.point_files import encode_points_like, read_point_file
 from ssad.recorders.shifted.manifest import (
     FOLDER,
@@ -249,7 +249,7 @@ def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[by
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):
         return None, "", applied
-    point_file = read_point_file(shifter.root / frame.filename)
+    point_file = read_point_file(nuscenes_path(shifter.root, frame.filename))
     if point_file.dropped_fields:
         applied = replace(applied, details={**applied.details, "dropped_fields": list(point_file.dropped_fields)})
     encoded = encode_points_like(point_file, points)
@@ -287,7 +287,7 @@ def _failed_line(shard: Shard, record: dict[str, Any], message: str) -> dict[str
 
 def _link(shard: Shard, record: dict[str, Any], *, is_required: bool = True) -> dict[str, Any]:
     """Link a file to the clean one and return its manifest line; a file that is not needed may be absent."""
-    source = shard.options.source / record["file"]
+    source = nuscenes_path(shard.options.source, record["file"])
     if not os.path.isfile(source):
         if is_required or os.path.lexists(source):
             return _failed_line(shard, record, f"{record['file']}: no such file")

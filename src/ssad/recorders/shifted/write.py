@@ -17,7 +17,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.folders import check_links_above
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
-from ssad.datasets.nuscenes.tables import stream, table_path
+from ssad.datasets.nuscenes.tables import nuscenes_path, stream, table_path
 from ssad.engine.pool import open_pool, run_all
 from ssad.engine.store import locked
 from ssad.recorders.parts import TIME_LIMIT, claim
@@ -144,7 +144,7 @@ def _open_root(options: Options, shift: str, severity: Strength, source: dict[st
             continue
         if any(folder.is_relative_to(os.path.realpath(entry)) for folder in sensor_folders):
             continue  # `samples` leads into it: a link to it would put the clean files beside the shifted ones
-        link(root, entry, root / entry.name)
+        link(root, nuscenes_path(options.source, entry.name), root / entry.name)
     # The annotation tables are written at the end; all other tables are linked.
     annotation_tables = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
     for table in sorted((options.source / options.version).glob("*.json")):

@@ -133,6 +133,7 @@ OF_TOWN = {
     "ProvingGround": "outskirts",
     "Ringmere": "town",
     "Longreach": "outskirts",
+    "HighSpeedTrack": "outskirts",
 }
 
 

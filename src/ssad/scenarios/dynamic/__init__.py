@@ -4,6 +4,7 @@ from ssad.scenarios.dynamic.catalogue import CUSTOM, PRECRASH, SCENARIOS, parame
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.importer import import_routes
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.parameters import scenario_parameters, with_parameters
 from ssad.scenarios.dynamic.sampling import sample_parameters, sampling_ranges
 from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
 from ssad.scenarios.dynamic.sets import load_scenarios, set_names
@@ -25,7 +26,9 @@ __all__ = [
     "save_scenarios",
     "scenario_data",
     "scenario_from",
+    "scenario_parameters",
     "scenario_text",
     "scenario_type",
     "set_names",
+    "with_parameters",
 ]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssad.core.errors import RouteError
+from ssad.core.errors import ConfigError, RouteError
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import TURN, LaneGraph
 from ssad.core.rotations import wrap_scalar
@@ -27,6 +27,7 @@ from ssad.core.types import (
 )
 from ssad.scenarios.dynamic.catalogue import scenario_type
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
+from ssad.scenarios.dynamic.knowledge._impact import place_actors
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import move_pose
 from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
@@ -60,24 +61,31 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
         RouteError: The town does not allow the scenario, or none of the draws has room for its actors.
     """
     check(scenario)
-    try:
-        route = _route(graph, scenario.route)
-    except RouteError as error:
-        raise RouteError(f"scenario {scenario.name}: {error}") from None
+    route = _scenario_route(scenario, graph)
     if spread == 0.0:
         return _build_one(scenario, graph, route, seed)
-    problem = None
+    problem: ConfigError | RouteError | None = None
     for attempt in range(_ATTEMPTS):
         random = generator("scenario", scenario.name, scenario.seed, seed, "spread", attempt)
+        drawn_scenario = sample_parameters(scenario, random, spread=spread)
         try:
-            return _build_one(
-                sample_parameters(scenario, random, spread=spread), graph, route, seed, require_clearance=True
-            )
-        except RouteError as error:
+            if scenario.expressions:  # a drawn parameter may give a key an impossible value, and the route another way
+                check(drawn_scenario)
+                route = _scenario_route(drawn_scenario, graph)
+            return _build_one(drawn_scenario, graph, route, seed, require_clearance=True)
+        except (ConfigError, RouteError) as error:
             problem = error
     raise RouteError(
         f"{problem} (the last of {_ATTEMPTS} draws with seed {seed} and spread {spread:g}; a smaller spread may do)"
     )
+
+
+def _scenario_route(scenario: Scenario, graph: LaneGraph) -> Route:
+    """Return the ego's route. RouteError, with the name of the scenario, if the town does not allow it."""
+    try:
+        return _route(graph, scenario.route)
+    except RouteError as error:
+        raise RouteError(f"scenario {scenario.name}: {error}") from None
 
 
 def _build_one(
@@ -87,6 +95,10 @@ def _build_one(
     scenario_kind = scenario_type(scenario.type)
     scenario = _fill_in_defaults(scenario, scenario_kind)
     values = scenario_kind.values(scenario.parameters)
+    try:
+        scenario = place_actors(scenario, route, values["ego_longitudinal"], values["ego_speed"])
+    except RouteError as error:
+        raise RouteError(f"scenario {scenario.name}: {error}") from None
     ego = EpisodeAgent(
         name="ego",
         model=scenario.ego_model,
@@ -113,14 +125,18 @@ def _build_one(
         )
     agents = (ego, *other_agents)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
-    check_all = require_clearance and any(parameter.spread for parameter in scenario_kind.parameters)
+    is_varied = any(parameter.spread for parameter in scenario_kind.parameters)
+    is_varied |= any(declaration.spread for declaration in scenario.declared.values())
+    check_all = require_clearance and is_varied
     _check_start(scenario, agents, movable=len(agents) if check_all else 1)
     return Episode(
         key=f"{scenario.name}@{digest(dump_json(scenario_data(scenario)), seed)[:12]}",
         scenario=scenario,
         town=scenario.town,
         agents=agents,
-        signal_override=dict(_cached_forced_signals(graph, route, scenario.signals, scenario_kind.whole_town)),
+        signal_override=dict(
+            _cached_forced_signals(graph, route, scenario.signals, scenario.trigger, scenario_kind.whole_town)
+        ),
         override_until=scenario.signals.until,
         limits=scenario.limits,
         seed=seed,
@@ -167,14 +183,14 @@ def _fill_in_defaults(scenario: Scenario, kind: ScenarioType) -> Scenario:
 
 @cached_by_identity()
 def _cached_forced_signals(
-    graph: LaneGraph, route: Route, plan: SignalPlan, whole_town: bool
+    graph: LaneGraph, route: Route, plan: SignalPlan, trigger: Pose | None, whole_town: bool
 ) -> dict[int, SignalState]:
     """Return `forced_signals`, cached for a route."""
-    return forced_signals(graph, route, plan, whole_town=whole_town)
+    return forced_signals(graph, route, plan, trigger=trigger, whole_town=whole_town)
 
 
 def forced_signals(
-    graph: LaneGraph, route: Route, plan: SignalPlan, *, whole_town: bool = False
+    graph: LaneGraph, route: Route, plan: SignalPlan, *, trigger: Pose | None = None, whole_town: bool = False
 ) -> dict[int, SignalState]:
     """Return the states that a signal plan forces.
 
@@ -185,6 +201,8 @@ def forced_signals(
             the other signals of the junctions on the route. Where the ego is to have red, only the junctions count at
             which the route turns to the near side, which it may do on red; a route without such a turn has red
             everywhere.
+        trigger: The place that the scenario is built around. Of several turns to the near side, the ego has red at
+            the one that follows it.
         whole_town: Apply the state of other signals to the whole map.
 
     Returns:
@@ -201,15 +219,30 @@ def forced_signals(
         if (int(graph.road[lane]), int(graph.section[lane]), bool(graph.forward[lane])) in approach
     }
     junctions = {int(junction) for junction in np.unique(graph.junction[lanes]) if junction >= 0}
+    route_junctions = junctions
     if plan.ego == "red":
-        junctions = near_side_turns(graph, route) or junctions
+        junctions = _red_junctions(graph, route, trigger) or junctions
     forced_states: dict[int, SignalState] = {}
     for signal in range(len(graph.signal_junction)):
         on_route_junction = int(graph.signal_junction[signal]) in junctions
         state_name = plan.ego if signal in ego_signals and on_route_junction else plan.others
+        if not on_route_junction and int(graph.signal_junction[signal]) in route_junctions:
+            crossing_state = "red" if plan.elsewhere == "green" else plan.elsewhere
+            on_route_junction, state_name = True, plan.elsewhere if signal in ego_signals else crossing_state
         if state_name != "program" and (not graph.signal_virtual[signal] if whole_town else on_route_junction):
             forced_states[signal] = _FORCED[state_name]
     return forced_states
+
+
+def _red_junctions(graph: LaneGraph, route: Route, trigger: Pose | None) -> set[int]:
+    """Return the junctions at which the ego has red: its turns to the near side, or the next one of a trigger."""
+    turns = near_side_turns(graph, route)
+    if trigger is None or len(turns) < 2:
+        return turns
+    start = int(np.argmin(np.hypot(route.xy[:, 0] - trigger.x, route.xy[:, 1] - trigger.y)))
+    junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
+    following_turns = [int(number) for number in junction[start:] if int(number) in turns]
+    return {following_turns[0]} if following_turns else turns
 
 
 def near_side_turns(graph: LaneGraph, route: Route) -> set[int]:

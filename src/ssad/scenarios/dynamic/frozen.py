@@ -72,6 +72,9 @@ def freeze_episode(episode: Episode, trace: EpisodeTrace, *, name: str | None = 
         actors=tuple(actors),
         traffic=None,
         source=f"{base.name}, seed {episode.seed}",
+        declared={},
+        expressions={},
+        constraints=(),
     )
 
 
@@ -88,7 +91,9 @@ def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
     return replace(
         scenario,
         actors=tuple(
-            replace(actor, pose=pose, phases=(), path=(), trajectory=trajectory) if actor.name == name else actor
+            replace(actor, pose=pose, phases=(), path=(), trajectory=trajectory, lateral=(), speed=0.0)
+            if actor.name == name
+            else actor
             for actor in scenario.actors
         ),
     )

@@ -3,11 +3,12 @@
 SafeBench and FREA: `scenario_type/*.json` lists episodes (scenario id, route id); routes are in
 `route/scenario_XX_routes/scenario_XX_route_YY.xml`, triggers and actors in
 `route/scenarios/scenario_XX.json`. Leaderboard: XML files of routes beside JSON files of triggers; every
-trigger on a route gives a scenario, a route without triggers a free drive in natural traffic. In a whole checkout of
+trigger on a route gives a scenario, a route without triggers a free drive in natural traffic, also one with the
+positions of leaderboard 2.0. In a whole checkout of
 SafeBench or FREA the two folders lie deeper (`config/scenario_type`, `scenario_data/route`) and are searched. CARLA's
 frame (x forward, y right, yaw clockwise in degrees) is converted here and nowhere else. The town is optional: a
 trigger is matched with the straight lines between key points first, then with the route through the town if it is
-imported. CARLA's weather is ignored.
+imported. CARLA's weather is not carried over.
 """
 
 from __future__ import annotations
@@ -18,17 +19,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.import_report import ImportReport
 from ssad.core.safeio import format_location, read_json, read_xml
-from ssad.core.types import EpisodeLimits, Pose, Scenario
+from ssad.core.types import EpisodeLimits, Pose, Scenario, SignalPlan
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE, PRECRASH, scenario_type
-from ssad.scenarios.dynamic.schema import problems
+from ssad.scenarios.dynamic.schema import name_part, problems
 from ssad.world.roads import load_town
 from ssad.world.roads.router import route_along
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 NATURAL_ID = 9
 _TYPES: dict[int, str] = {**dict(enumerate(PRECRASH, start=1)), NATURAL_ID: "NaturalJunction"}
@@ -61,6 +66,13 @@ _PARAMETERS: dict[int, tuple[str, ...]] = {
     **dict.fromkeys((5, 6, 7, 8), ("speed", "trigger_distance")),
 }
 """What the numbers of an entry mean in SafeBench's lists `human` and `random`, by scenario id."""
+# A red light outside the conflict would outlast SafeBench's 30 s: there the ego has green.
+_SIGNALS: dict[str, SignalPlan] = {
+    **dict.fromkeys(
+        ("StraightObstacle", "TurningObstacle", "LaneChanging", "VehiclePassing"), SignalPlan(ego="green", others="red")
+    ),
+    "RightTurn": replace(scenario_type("RightTurn").signals, elsewhere="green"),
+}
 _NEAR = 2.0  # m between a trigger and the route
 _FAR = 1e9  # m; the square of a longer way may be beyond a float
 _ALIGNED = math.radians(10.0)
@@ -93,37 +105,41 @@ class _ImportedRoute:
     ident: str
     town: str
     points: tuple[Pose, ...]
+    has_weather: bool = False
 
 
-def import_routes(folder: Path, *, omissions: list[str] | None = None) -> tuple[Scenario, ...]:
+def import_routes(folder: Path, *, report: ImportReport | None = None) -> tuple[Scenario, ...]:
     """Import all scenarios of a folder, in its order; of several lists the longest one without parameters.
 
     Args:
         folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`,
             such as SafeBench's human.json or random.json, whose entries have parameters of their own.
-        omissions: Collects a line for each broken entry of a list, which is skipped; None: the first broken entry
-            raises.
+        report: Filled with what came in, what is not carried over, and what is doubtful: broken entries of a list,
+            which are skipped; None: the first broken entry raises.
 
     Raises:
         FormatError: An entry is broken (the message names it and its place), or no entry is left.
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":
-        return _scenarios_of_list(_routes_of(folder.parent), _read_list(folder, omissions), folder, omissions)
+        return _scenarios_of_list(_routes_of(folder.parent), _read_list(folder, report), folder, report)
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder")
     lists = sorted(path for list_folder in _scenario_types(folder) for path in list_folder.glob("*.json"))
     if lists:
-        entries_by_list: dict[Path, tuple[list[_Entry], list[str]]] = {}
+        entries_by_list: dict[Path, tuple[list[_Entry], ImportReport]] = {}
         for path in lists:
-            list_errors: list[str] = []
-            entries_by_list[path] = _read_list(path, None if omissions is None else list_errors), list_errors
+            list_report = ImportReport(str(path))
+            entries_by_list[path] = _read_list(path, None if report is None else list_report), list_report
         preferred_list = max(lists, key=lambda path: _list_priority(entries_by_list[path][0]))
-        entries, list_errors = entries_by_list[preferred_list]
-        if omissions is not None:
-            omissions += list_errors
-        return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, omissions)
-    return _leaderboard(folder, omissions)
+        entries, list_report = entries_by_list[preferred_list]
+        if report is not None:
+            report.extend(list_report)
+            for path in lists:
+                if path != preferred_list:
+                    report.omit(f"other lists than {preferred_list.name}; give a list by its path", path.name)
+        return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, report)
+    return _leaderboard(folder, ImportReport(str(folder)) if report is None else report)
 
 
 def free_drive(name: str, town: str, points: tuple[Pose, ...], *, source: str) -> Scenario:
@@ -175,7 +191,7 @@ def _routes_of(lists: Path) -> Path:
 # ---------------------------------------------------------------- SafeBench, FREA
 
 
-def _read_list(path: Path, left_out: list[str] | None) -> list[_Entry]:
+def _read_list(path: Path, report: ImportReport | None) -> list[_Entry]:
     """Read the entries of a list in the order of data_id; entries of other scenarios are skipped."""
     entries = read_json(path)
     if not isinstance(entries, list):
@@ -197,10 +213,9 @@ def _read_list(path: Path, left_out: list[str] | None) -> list[_Entry]:
                 (identifiers[0], _Entry(identifiers[1], identifiers[2], _values(entry, identifiers[1])))
             )
         except FormatError as error:
-            message = f"{path}: entry {index}: {error}"
-            if left_out is None:
-                raise FormatError(message) from None
-            left_out.append(message)
+            if report is None:
+                raise FormatError(f"{path}: entry {index}: {error}") from None
+            report.doubt(f"an entry is left out: {error}", f"{path.name}, entry {index}")
     numbered_entries.sort(key=lambda row: row[0])
     return [row[1] for row in numbered_entries]
 
@@ -230,11 +245,12 @@ def _values(entry: Mapping[str, Any], number: int) -> dict[str, float]:
 
 
 def _scenarios_of_list(
-    routes: Path, entries: Sequence[_Entry], listing: Path, left_out: list[str] | None
+    routes: Path, entries: Sequence[_Entry], listing: Path, report: ImportReport | None
 ) -> tuple[Scenario, ...]:
     """Build the scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
     if not entries:
-        raise FormatError(f"{listing}: no entry of it can be read{f'; the first: {left_out[0]}' if left_out else ''}")
+        reason = next(iter(report.doubts), "") if report else ""
+        raise FormatError(f"{listing}: no entry of it can be read{f'; the first: {reason}' if reason else ''}")
     suite = "frea" if all(entry.number == NATURAL_ID for entry in entries) else "safebench"
     title = {"frea": "FREA", "safebench": "SafeBench"}[suite]
     # Only routes that occur several times get a repetition number in their names.
@@ -254,9 +270,9 @@ def _scenarios_of_list(
                     raise FormatError(f"{path}: no such route file; {listing.name} asks for it")
                 scenario_cache[route_key] = _scenario(path, _TYPES[number], events_by_number[number])
             except FormatError as error:
-                if left_out is None:
+                if report is None:
                     raise
-                left_out.append(str(error))
+                report.doubt(f"a route is left out: {error}")
                 scenario_cache[route_key] = None
         base, repetition = scenario_cache[route_key], built_counts[route_key]
         if base is None:
@@ -272,8 +288,11 @@ def _scenarios_of_list(
         parameters = {**base.parameters, **entry.parameters}
         scenarios.append(replace(base, name=name, group=group, seed=repetition, source=source, parameters=parameters))
     if not scenarios:
-        assert left_out
-        raise FormatError(f"{listing}: none of its routes can be read; the first: {left_out[0]}")
+        reasons = report.doubts if report else ()
+        reason = next((reason for reason in reasons if reason.startswith("a route")), "")
+        raise FormatError(f"{listing}: none of its routes can be read; the first: {reason}")
+    if report is not None:
+        report.contents.append(f"{title}: {len(scenarios)} of {len(entries)} entries of {listing.name}")
     return tuple(scenarios)
 
 
@@ -295,6 +314,7 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
         route=route.points,
         trigger=event.trigger if event else None,
         placements=event.placements if event and kind in _PLACED else (),
+        signals=_SIGNALS.get(kind, SignalPlan()),
     )
     if kind in _PLACED and not scenario.placements:
         raise FormatError(f"{path}: its trigger names no other actor, which {kind} needs")
@@ -346,28 +366,42 @@ def _position_along(route: _ImportedRoute, trigger: Pose) -> float | None:
 # ---------------------------------------------------------------- leaderboard 1.0
 
 
-def _leaderboard(folder: Path, omissions: list[str] | None) -> tuple[Scenario, ...]:
+def _leaderboard(folder: Path, report: ImportReport) -> tuple[Scenario, ...]:
     """Return a scenario for each trigger on a route, and a free drive for each route without triggers."""
     routes = sorted(folder.rglob("*.xml"))
     tables = sorted(folder.rglob("*.json"))
     if not routes:
         raise FormatError(f"{folder}: no scenario_type/*.json and no route files (*.xml) in it")
-    events = [trigger_event for path in tables for trigger_event in _read_events(path, strict=False)]
+    events = [trigger_event for path in tables for trigger_event in _read_events(path, report)]
     scenarios: list[Scenario] = []
+    matched: set[int] = set()
+    route_count = 0
     for path in routes:
         for route in _read_roads(path):
             triggers = _triggers(route, events)
-            name, source = f"leaderboard/{path.stem}_{route.ident}", f"leaderboard route {route.ident} of {path.name}"
+            route_count += 1
+            matched.update(index for _, index in triggers)
+            if route.has_weather:
+                report.omit("weather of a route", f"{path.name}, route {route.ident}")
+            name = f"leaderboard/{name_part(path.stem)}_{route.ident}"
+            source = f"leaderboard route {route.ident} of {path.name}"
             if not triggers:
                 scenarios.append(
                     _check_scenario(free_drive(f"{name}/{FREE_DRIVE}", route.town, route.points, source=source), path)
                 )
-                if events and omissions is not None:
-                    omissions.append(f"{path}: no trigger lies on the route (2 m, 10 degrees): a free drive")
+                if events:
+                    report.note(
+                        "routes on which no trigger lies (2 m, 10 degrees) become free drives",
+                        f"{path.name}, route {route.ident}",
+                    )
             count: Counter[str] = Counter()
             for _, event_index in triggers:
                 event = events[event_index]
                 if event.type in _PLACED and not event.placements:
+                    report.omit(
+                        f"triggers of {event.type} without the other actors that it needs",
+                        f"{path.name}, route {route.ident}",
+                    )
                     continue
                 scenario = Scenario(
                     name=f"{name}/{event.type}_{count[event.type]:02d}",
@@ -383,6 +417,9 @@ def _leaderboard(folder: Path, omissions: list[str] | None) -> tuple[Scenario, .
                 scenarios.append(_check_scenario(scenario, path))
     if not scenarios:
         raise FormatError(f"{folder}: its triggers name no other actors, which their types need")
+    if unmatched := len(events) - len(matched):
+        report.omit("triggers that lie on no route", count=unmatched)
+    report.contents.append(f"leaderboard 1.0: {len(scenarios)} scenarios of {route_count} routes")
     return tuple(scenarios)
 
 
@@ -397,29 +434,44 @@ def _read_roads(path: Path) -> list[_ImportedRoute]:
         if not town:
             raise FormatError(f"{path}: route {route_id or '?'} names no town")
         location = f"{path}: route {route_id or '?'}"
-        points = tuple(
-            _pose(point.attrib, f"{location}: waypoint {index}") for index, point in enumerate(element.iter("waypoint"))
-        )
-        if len(points) < 2:
-            raise FormatError(f"{location}: needs at least two waypoints, has {len(points)}")
-        imported_routes.append(_ImportedRoute(route_id or str(len(imported_routes)), town, points))
+        if element.find("scenarios/scenario") is not None:
+            raise FormatError(f"{location}: has scenarios of leaderboard 2.0; import the file: ssad import leaderboard")
+        places = element.findall("waypoints/position") or list(element.iter("waypoint"))
+        if len(places) < 2:
+            raise FormatError(f"{location}: needs at least two waypoints, has {len(places)}")
+        points = _with_headings(places, location)
+        has_weather = next(element.iter("weather"), None) is not None
+        imported_routes.append(_ImportedRoute(route_id or str(len(imported_routes)), town, points, has_weather))
     if not imported_routes:
         raise FormatError(f"{path}: no <route> in it")
     return imported_routes
 
 
-def _read_events(path: Path, *, strict: bool = True) -> list[_Event]:
-    """Read the triggers of a JSON file; `strict`: another file format or an unknown scenario is an error."""
+def _with_headings(places: Sequence[Element], location: str) -> tuple[Pose, ...]:
+    """Return the points of a route; those without a heading, as in leaderboard 2.0, look to the next."""
+    points = [
+        _pose({"yaw": "0", **place.attrib}, f"{location}: waypoint {index}") for index, place in enumerate(places)
+    ]
+    for index, place in enumerate(places):
+        if "yaw" not in place.attrib:
+            start, end = points[index : index + 2] if index + 1 < len(points) else points[-2:]
+            points[index] = replace(points[index], yaw=math.atan2(end.y - start.y, end.x - start.x))
+    return tuple(points)
+
+
+def _read_events(path: Path, report: ImportReport | None = None) -> list[_Event]:
+    """Read the triggers of a JSON file; without a report, another file format or an unknown scenario is an error."""
     document = read_json(path)
     blocks = document.get("available_scenarios") if isinstance(document, dict) else None
     if not isinstance(blocks, list):
-        if strict:
+        if report is None:
             raise FormatError(f"{path}: expected an object with the list available_scenarios")
+        report.omit("JSON files that hold no triggers", path.name)
         return []
-    return [event for block in blocks for event in _block_events(path, block, strict)]
+    return [event for block in blocks for event in _block_events(path, block, report)]
 
 
-def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
+def _block_events(path: Path, block: Any, report: ImportReport | None) -> Iterator[_Event]:
     if not isinstance(block, dict):
         raise FormatError(f"{path}: available_scenarios should hold objects that map towns to scenarios")
     for town, scenarios in block.items():
@@ -428,8 +480,9 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
                 raise FormatError(f"{path}: {town}: expected objects with available_event_configurations")
             scenario_name = str(scenario.get("scenario_name", scenario.get("scenario_type")))
             if scenario_name not in _NAMES:
-                if strict:
+                if report is None:
                     raise FormatError(f"{path}: {town}: unknown scenario '{scenario_name}'; known: {', '.join(_NAMES)}")
+                report.omit(f"triggers of {scenario_name[:40]}, which has no counterpart", f"{path.name}, {town[:40]}")
                 continue
             configurations = scenario.get("available_event_configurations")
             for index, event in enumerate(_as_list(configurations, f"{path}: {town}: {scenario_name}")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -16,8 +17,12 @@ from ssad.core.safeio import Document, Location, format_location
 from ssad.core.types import (
     Actor,
     AgentKind,
+    Arrival,
     Body,
+    DeclaredParameter,
     EpisodeLimits,
+    Impact,
+    LateralPhase,
     Phase,
     PhaseTrigger,
     Pose,
@@ -26,13 +31,30 @@ from ssad.core.types import (
     TrafficPlan,
 )
 from ssad.scenarios.dynamic.catalogue import CUSTOM, scenario_type
+from ssad.scenarios.dynamic.parameters import insert_expressions, parameter_problems, resolve_data
+from ssad.scenarios.dynamic.phases import phase_problems
 from ssad.world.models import model, model_with_body
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
-_DATA = (Scenario, Pose, Body, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits)
-_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
+_DATA = (
+    Scenario,
+    Pose,
+    Body,
+    Actor,
+    Phase,
+    LateralPhase,
+    Arrival,
+    PhaseTrigger,
+    SignalPlan,
+    TrafficPlan,
+    EpisodeLimits,
+    DeclaredParameter,
+    Impact,
+)
+_DERIVED = ("declared", "expressions")  # fields of a scenario that stand elsewhere in its file
+_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+=\-]*(/[A-Za-z0-9_][A-Za-z0-9_.:@+=\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
 _BODY_LIMITS = {
@@ -61,6 +83,12 @@ def _adapter() -> TypeAdapter[Scenario]:
     return TypeAdapter(Scenario)
 
 
+def name_part(text: str) -> str:
+    """Return a text, such as the name of a file, as a part of a name: what no name may hold becomes "_"."""
+    part = re.sub(r"[^A-Za-z0-9_.:@+\-]", "_", text)
+    return part if part[:1].isalnum() else f"0{part}"
+
+
 def scenario_from(data: Any, document: Document | None = None, place: Location = ()) -> Scenario:
     """Validate plain data and return the scenario.
 
@@ -80,7 +108,11 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
     source_document = document or Document("scenario", data)
     if not isinstance(data, Mapping):
         raise source_document.error(place, f"a scenario is a mapping of keys, not {_abbreviated(data)}")
+    for key in _DERIVED:
+        if key in data:
+            raise source_document.error((*place, key), f"unknown key; known: {', '.join(_fields_at(()))}")
     try:
+        data = _with_poses(resolve_data(data, source_document, place), source_document, place)
         # JSON mode is the strict one that still takes lists for tuples and words for literals
         text = json.dumps(data, default=str)
         scenario = _adapter().validate_json(text, strict=True)
@@ -90,8 +122,26 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
     except (ValueError, TypeError) as error:
         raise source_document.error(place, f"not plain data: {error}") from None
     for location, message in problems(scenario):
-        raise source_document.error((*place, *location), message)
+        expression = scenario.expressions.get(format_location(location))
+        suffix = f" (the value of '{expression}')" if expression else ""
+        raise source_document.error((*place, *location), message + suffix)
     return scenario
+
+
+def _with_poses(data: dict[str, Any], document: Document, place: Location) -> dict[str, Any]:
+    """Return data in which actors with an impact have a pose, which their episode replaces."""
+    actors = data.get("actors")
+    if not isinstance(actors, list) or not any(isinstance(a, Mapping) and a.get("impact") for a in actors):
+        return data
+    placed_actors = list(actors)
+    for index, actor in enumerate(actors):
+        if isinstance(actor, Mapping) and actor.get("impact"):
+            for key in ("pose", "path"):
+                if key in actor:
+                    message = f"an actor with an impact has no {key}, which follows from it"
+                    raise document.error((*place, "actors", index, key), message)
+            placed_actors[index] = {**actor, "pose": {"x": 0.0, "y": 0.0}}
+    return {**data, "actors": placed_actors}
 
 
 def check(scenario: Scenario) -> None:
@@ -112,6 +162,8 @@ def _explain(error: ValidationError) -> tuple[tuple[str | int, ...], str]:
     # a misspelt key also makes another key missing: report the misspelling
     first_error = min(errors, key=lambda e: e["type"] not in _UNKNOWN_KEY)
     location = tuple(first_error["loc"])
+    if location and location[0] == "declared":
+        location = ("parameters", *location[1:])
     error_type = first_error["type"]
     if error_type in _UNKNOWN_KEY:
         fields = _fields_at(location[:-1])
@@ -134,16 +186,21 @@ def _fields_at(location: Location) -> list[str]:
         "pose": Pose,
         "actors": Actor,
         "phases": Phase,
+        "lateral": LateralPhase,
+        "arrival": Arrival,
         "when": PhaseTrigger,
         "signals": SignalPlan,
         "traffic": TrafficPlan,
         "limits": EpisodeLimits,
+        "parameters": DeclaredParameter,
+        "impact": Impact,
         "body": Body,
         "ego_body": Body,
     }
     for part in location:
         dataclass_type = type_of_key.get(str(part), dataclass_type) if isinstance(part, str) else dataclass_type
-    return [dataclass_field.name for dataclass_field in dataclasses.fields(dataclass_type)]
+    names = [dataclass_field.name for dataclass_field in dataclasses.fields(dataclass_type)]
+    return [name for name in names if dataclass_type is not Scenario or name not in _DERIVED]
 
 
 def _abbreviated(value: Any) -> str:
@@ -161,7 +218,7 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         Location of the value among the scenario's keys, and a message.
     """
     if not _NAME.match(scenario.name):
-        yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+/ between them"
+        yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+=/ between them"
     if not scenario.town:
         yield ("town",), "name the town (ssad list towns)"
     if len(scenario.route) < 2:
@@ -178,15 +235,11 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
     elif scenario.actors:
         yield ("actors",), f"only type {CUSTOM} takes actors; {scenario.type} makes its own"
     try:
-        box = scenario_type(scenario.type).box
+        scenario_type(scenario.type)
     except ConfigError as error:
         yield ("type",), str(error)
         return
-    for name, value in scenario.parameters.items():
-        if name not in box:
-            yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box)}"
-        elif problem := box[name].problem(value):
-            yield ("parameters", name), problem
+    yield from parameter_problems(scenario)
 
 
 def _ego(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -249,6 +302,7 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 
 def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    max_speeds: dict[int, float] = {}
     for actor_index, actor in enumerate(scenario.actors):
         location = ("actors", actor_index)
         try:
@@ -265,14 +319,31 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
             yield (*location, "path"), "a path needs at least two points"
         yield from _trajectory(actor, location)
         yield from _policy(actor, location, max_speed)
-        for phase_index, phase in enumerate(actor.phases):
-            phase_location = (*location, "phases", phase_index)
-            if not 0.0 <= phase.speed <= max_speed:
-                yield (*phase_location, "speed"), f"{phase.speed:g} is outside 0 to {max_speed:g} m/s ({actor.model})"
-            if not 0 <= phase.when.actor < len(scenario.actors):
-                yield (*phase_location, "when", "actor"), f"there are actors 0 to {len(scenario.actors) - 1}"
-            if phase.when.value < 0.0:
-                yield (*phase_location, "when", "value"), "must not be negative"
+        yield from _impact(actor, location)
+        max_speeds[actor_index] = max_speed
+    yield from phase_problems(scenario.actors, max_speeds)
+
+
+def _impact(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    impact = actor.impact
+    if impact is None:
+        return
+    location = (*place, "impact")
+    if actor.trajectory:
+        yield location, "an actor with a trajectory has no impact"
+    if not 0.0 < impact.distance <= _MAX_COORDINATE:
+        yield (*location, "distance"), f"{impact.distance:g} is outside 0 to {_MAX_COORDINATE:g} m"
+    if not -2.0 <= impact.location <= 3.0:
+        yield (*location, "location"), f"{impact.location:g} is outside -2 to 3 widths of the ego"
+    if impact.overlap is not None:
+        if not 0.0 <= impact.overlap <= 1.0:
+            yield (*location, "overlap"), f"{impact.overlap:g} is outside 0 to 1"
+        if impact.location != Impact.location:
+            yield (*location, "location"), "give either the location or the overlap"
+    if impact.ego_speed is not None and not 0.0 < impact.ego_speed <= MAX_SPEED:
+        yield (*location, "ego_speed"), f"{impact.ego_speed:g} is outside 0 to {MAX_SPEED:g} m/s"
+    if abs(impact.heading) > 2.0 * math.pi:
+        yield (*location, "heading"), f"{impact.heading:g} is more than a full turn; angles are in radians"
 
 
 def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -314,40 +385,61 @@ def _policy(actor: Actor, place: Location, fastest: float) -> Iterator[tuple[tup
         yield (*place, "target_speed"), f"{actor.target_speed:g} is outside 0 to {fastest:g} m/s ({actor.model})"
 
 
-def scenario_data(scenario: Scenario) -> dict[str, Any]:
+def scenario_data(scenario: Scenario, *, defaults: bool = False) -> dict[str, Any]:
     """Return the plain data of a scenario.
 
     Args:
         scenario: The scenario.
+        defaults: Whether fields that have their defaults are written out, as far as scenarios have always had them:
+            seeds of cells depend on these data, and a new field must not change those of scenarios without it.
 
     Returns:
-        Data for YAML or JSON without defaults; `scenario_from` restores the scenario.
+        Data for YAML or JSON; `scenario_from` restores the scenario.
     """
-    data: dict[str, Any] = _plain(scenario)
+    data: dict[str, Any] = _plain(dataclasses.replace(scenario, declared={}, expressions={}), defaults)
+    for actor, actor_data in zip(scenario.actors, data.get("actors", ()), strict=True):
+        if actor.impact is not None:
+            del actor_data["pose"]
+            actor_data.pop("path", None)
+    insert_expressions(data, scenario)
     return data
 
 
+_FIRST_FIELDS: dict[type, str] = {
+    Scenario: "name type town route trigger placements parameters actors signals traffic limits target_speed seed "
+    "group source",
+    Actor: "name model pose phases path trajectory policy target_speed",
+    Phase: "speed when",
+    PhaseTrigger: "kind value actor",
+    Pose: "x y yaw",
+    SignalPlan: "ego others until",
+    TrafficPlan: "intensity minimum maximum wake_distance draw",
+    EpisodeLimits: "max_steps max_time max_distance contact",
+}
+"""Fields that are written out with `defaults`."""
 _AS_THEY_ARE = (float, int, str, bool, type(None))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, defaults: bool) -> Any:
     if isinstance(value, tuple):  # fast path: scenarios with trajectories consist mostly of rows of numbers
-        return [element if type(element) in _AS_THEY_ARE else _plain(element) for element in value]
+        return [element if type(element) in _AS_THEY_ARE else _plain(element, defaults) for element in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         mapping = {}
+        written_fields = _FIRST_FIELDS.get(type(value), "").split() if defaults else ()
         for dataclass_field in dataclasses.fields(value):
             field_value = getattr(value, dataclass_field.name)
-            if dataclass_field.default is not dataclasses.MISSING and field_value == dataclass_field.default:
+            if dataclass_field.name not in written_fields and _is_default(dataclass_field, field_value):
                 continue
-            if (
-                dataclass_field.default_factory is not dataclasses.MISSING
-                and field_value == dataclass_field.default_factory()
-            ):
-                continue
-            mapping[dataclass_field.name] = _plain(field_value)
+            mapping[dataclass_field.name] = _plain(field_value, defaults)
         return mapping
     if isinstance(value, Mapping):
-        return {str(key): _plain(element) for key, element in value.items()}
+        return {str(key): _plain(element, defaults) for key, element in value.items()}
     if isinstance(value, float):
         return float(value)  # a numpy scalar would not be written as a plain number
     return value
+
+
+def _is_default(dataclass_field: dataclasses.Field[Any], value: Any) -> bool:
+    if dataclass_field.default is not dataclasses.MISSING:
+        return bool(value == dataclass_field.default)
+    return dataclass_field.default_factory is not dataclasses.MISSING and value == dataclass_field.default_factory()

@@ -42,7 +42,7 @@ from ssad.simulators.carla.events import Events
 from ssad.simulators.carla.sensors import EgoSensors, SensorBlueprint
 from ssad.simulators.carla.server import Server, T, call_server, connect
 from ssad.simulators.carla.traffic import Traffic
-from ssad.simulators.mirrored import MirroredSimulator
+from ssad.simulators.mirrored import MirroredSimulator, check_phases
 from ssad.world.kernels.data import Presence
 from ssad.world.models import MODELS, WALKER_RATE
 from ssad.world.roads import town_signals, town_xodr
@@ -85,6 +85,7 @@ class Carla(MirroredSimulator):
         assign: Scenes | None = None,
         blueprints: Mapping[str, SensorBlueprint] | None = None,
     ) -> None:
+        check_phases(episodes, "CARLA")
         self.mirror = World(episodes, graphs, assign=assign)
         if self.mirror.batch != 1:
             raise ConfigError(f"{server} runs one world: it takes one scene at a time, not {self.mirror.batch}")

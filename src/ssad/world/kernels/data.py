@@ -1,6 +1,7 @@
 """Arrays that the kernels share, as Warp structs.
 
-Legend: B scenes, A agents, E episodes of the bank, K phases, N route points of the pool, M lane segments, S signals.
+Legend: B scenes, A agents, E episodes of the bank, P phases, G groups of conditions, C conditions, H words of history,
+N route points of the pool, M lane segments, S signals.
 """
 
 from enum import IntEnum
@@ -33,6 +34,57 @@ class PhaseCondition(IntEnum):
     TRAVELLED = 3
     TIME = 4
     AFTER = 5
+    SPEED = 6
+    RELATIVE_SPEED = 7
+    ACCELERATION = 8
+    STANDSTILL = 9
+    DISTANCE = 10
+    TIME_TO_COLLISION = 11
+    TIME_HEADWAY = 12
+    POSITION = 13
+    PHASE_START = 14
+    PHASE_END = 15
+
+
+class Edge(IntEnum):
+    """Change of a condition that counts: the words of `ssad.core.types.PhaseTrigger.edge`."""
+
+    NONE = 0
+    RISING = 1
+    FALLING = 2
+    BOTH = 3
+
+
+class Measure(IntEnum):
+    """Way to measure a distance: the words of `ssad.core.types.PhaseTrigger.measure`, in their order."""
+
+    STRAIGHT = 0
+    ROAD = 1
+    LATERAL = 2
+
+
+class SpeedShape(IntEnum):
+    """Course of a speed or a lateral position: the words of `ssad.core.types.Shape`."""
+
+    LINEAR = 0
+    SINUSOIDAL = 1
+    CUBIC = 2
+    STEP = 3
+
+
+class SpeedProfile(IntEnum):
+    """Quantity that fixes the pace of a phase.
+
+    LIMITED follows the target with limited acceleration and jerk; the others are given by a time, a distance, the
+    greatest rate, nothing at all, or a meeting.
+    """
+
+    LIMITED = 0
+    DURATION = 1
+    DISTANCE = 2
+    RATE = 3
+    STEP = 4
+    ARRIVAL = 5
 
 
 class Presence(IntEnum):
@@ -75,9 +127,7 @@ class EpisodeArrays:
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
-    phase_count: wp.array2d(dtype=wp.int32)  # [E, A]
-    phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] When, value, agent
-    phase_speed: wp.array3d(dtype=wp.float32)  # [E, A, K]
+    script: wp.array2d(dtype=wp.vec4i)  # [E, A] first phase of the episode's, phases, lateral phases, 1 if scripted
     town: wp.array(dtype=wp.int32)  # [E]
     signal: wp.array2d(dtype=wp.int32)  # [E, S] forced SignalState, -1 none
     limits: wp.array(dtype=wp.vec4)  # [E] max steps, max time s, max distance m, override until s
@@ -134,7 +184,6 @@ class State:
     active: wp.array2d(dtype=wp.int32)  # [B, A] Presence
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
-    since: wp.array2d(dtype=wp.int32)  # [B, A] step at which the last of them began, if the next waits for it; else 0
     travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
     halted: wp.array2d(dtype=wp.int32)  # [B, A] route point at whose stop sign it has stopped, -1 none
     stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out
@@ -150,6 +199,46 @@ class State:
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
     lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
     touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent
+
+
+@wp.struct
+class Scripts:
+    """Phases of scripted agents and the conditions that start them, of all episodes of the bank one after the other.
+
+    An agent's lateral phases follow its phases. Phases are numbered within their episode.
+    """
+
+    episode: wp.array(dtype=wp.vec4i)  # [E] first row of its phases, their number; first condition, their number
+    begin: wp.array(dtype=wp.vec2i)  # [P] first group of conditions, number of groups: one of them must hold
+    anytime: wp.array(dtype=wp.int32)  # [P] 1: does not wait for the phases before it
+    motion: wp.array(dtype=wp.vec4)  # [P] speed m/s, acceleration m/s^2 (0: the model's), jerk m/s^3 (0: any), timing
+    # [P] SpeedProfile, SpeedShape, agent (-1: none), 1 factor + 2 continuous + 4 there is a speed; of lateral phases
+    # SpeedProfile, SpeedShape, first row and number of rows of `target`
+    course: wp.array(dtype=wp.vec4i)
+    meeting: wp.array(dtype=wp.vec4)  # [P] point x, y, m along the agent's route (-1: it has none)
+    other_meeting: wp.array(dtype=wp.vec4)  # [P] likewise for the other agent
+    group: wp.array(dtype=wp.vec2i)  # [G] first condition, number of conditions: all of them must hold
+    condition: wp.array(dtype=wp.vec4i)  # [C] PhaseCondition, agent, other agent (-1: the position), phase (-1: none)
+    form: wp.array(dtype=wp.vec4i)  # [C] 1 above (0 below), Edge, 1 between the bodies, Measure
+    number: wp.array(dtype=wp.vec4)  # [C] value, position x, y
+    ring: wp.array(dtype=wp.vec3i)  # [C] first word of its history, bits (0: none), delay in steps
+    target: wp.array(dtype=wp.float32)  # m left of the route to which lateral phases lead, at each route point
+
+
+@wp.struct
+class ScriptState:
+    """Changing state of scripts. A stamp is 1 + the step at whose start something happens; 0: it has not happened."""
+
+    begun: wp.array2d(dtype=wp.int32)  # [B, P] stamp of the begin of a phase
+    ended: wp.array2d(dtype=wp.int32)  # [B, P] stamp of its end
+    history: wp.array2d(dtype=wp.int32)  # [B, H] values of conditions in the last steps, a bit each
+    running: wp.array2d(dtype=wp.vec2i)  # [B, A] 1 + the number of the running phase and lateral phase; 0: none
+    course: wp.array2d(dtype=wp.vec4)  # [B, A] speed at the start of the phase m/s, target m/s, duration s, accel m/s^2
+    # [B, A] of the lateral phase: m left of the route at its start, place there m along the route, duration s or
+    # length m, 1 if it is a length
+    swerve: wp.array2d(dtype=wp.vec4)
+    rail: wp.array2d(dtype=wp.vec2)  # [B, A] place m along the route and m left of it; only of agents that may swerve
+    goal: wp.array2d(dtype=wp.vec4)  # [B, A] x, y, yaw and speed at the end of the step; the pose only of the same
 
 
 @wp.struct

@@ -1,6 +1,7 @@
-"""Controllers: Autopilot (perceives everything, yields), route follower (perceives nothing), scripted phases.
+"""Controllers: Autopilot (perceives everything, yields) and route follower (perceives nothing).
 
-The Autopilot is the background traffic and the ego baseline alike; its reactions to others are in `traffic`.
+The Autopilot is the background traffic and the ego baseline alike; its reactions to others are in `traffic`. Scripts
+are in `script`.
 """
 
 import warp as wp
@@ -12,7 +13,6 @@ from ssad.world.kernels.data import (
     End,
     EpisodeArrays,
     PerceivedAgents,
-    PhaseCondition,
     Presence,
     Roads,
     State,
@@ -44,26 +44,6 @@ def idm_free(v: float, target: float) -> float:
         return wp.max(-2.0 * (v - target), -4.0)
     ratio = v / wp.max(target, 0.1)
     return IDM_ACCEL * (1.0 - ratio * ratio * ratio * ratio)
-
-
-@wp.func
-def condition_holds(state: State, b: int, i: int, condition: wp.vec3, dt: float) -> bool:
-    """Return whether a phase may begin; when: `PhaseCondition`, value, agent."""
-    kind = int(condition[0])
-    holds = kind == PhaseCondition.ALWAYS
-    if kind == PhaseCondition.EGO_DISTANCE:
-        ego_pose = state.pose[b, 0]
-        other_pose = state.pose[b, int(condition[2])]
-        holds = wp.length(wp.vec2(ego_pose[0] - other_pose[0], ego_pose[1] - other_pose[1])) < condition[1]
-    elif kind == PhaseCondition.EGO_SPEED:
-        holds = state.speed[b, 0] > condition[1]
-    elif kind == PhaseCondition.TRAVELLED:
-        holds = state.travelled[b, i] > condition[1]
-    elif kind == PhaseCondition.TIME:
-        holds = float(state.step[b]) * dt >= condition[1] - 1.0e-4
-    elif kind == PhaseCondition.AFTER:
-        holds = float(state.step[b] - state.since[b, i]) * dt >= condition[1] - 1.0e-4
-    return holds
 
 
 @wp.func
@@ -204,40 +184,11 @@ def drive_one(
         return
     power = bank.power[model]
     target = state.cruise[b, i]
-    count = bank.phase_count[e, i]
-    if count > 0:
-        phase = state.phase[b, i]
-        advancing = int(1)
-        while phase < count and advancing == 1:
-            if condition_holds(state, b, i, bank.phase_when[e, i, phase], dt):
-                phase = phase + 1
-                state.since[b, i] = 0
-                if phase < count and int(bank.phase_when[e, i, phase][0]) == PhaseCondition.AFTER:
-                    state.since[b, i] = state.step[b]
-            else:
-                advancing = 0
-        state.phase[b, i] = phase
-        if phase > 0:
-            target = bank.phase_speed[e, i, phase - 1]
-        elif controller == Controller.SCRIPT:
-            target = 0.0
     if controller == Controller.NONE:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
     elif controller == Controller.SCRIPT:
-        if count == 0:
-            target = 0.0
-        steer = float(0.0)
-        if bank.route[e, i][1] > 1:
-            steer = steer_on_route(bank, roads, state, b, i, e, speed, 0.0)
-        throttle = float(0.0)
-        brake = float(1.0)
-        if bank.kind[model] == AgentKind.WALKER:
-            throttle = target / power[2]
-            brake = 0.0
-        elif target > 0.0 and speed <= target:
-            throttle = 1.0
-            brake = 0.0
-        state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
+        if bank.script[e, i][3] == 0:  # `run_scripts` drives the others
+            state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
     elif controller == Controller.AUTOPILOT or controller == Controller.FOLLOW:
         steer = float(0.0)
         accel = float(0.0)

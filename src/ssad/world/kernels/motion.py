@@ -3,7 +3,7 @@
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, State
+from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, ScriptState, State
 from ssad.world.kernels.shared import lane_under, on_track, row, sign_line, track_at, wrap
 from ssad.world.models import REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
@@ -89,6 +89,7 @@ def move_one(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
+    script: ScriptState,
     action: wp.array2d(dtype=wp.vec4),
     place: wp.array2d(dtype=wp.vec4),
     b: int,
@@ -122,7 +123,15 @@ def move_one(
     speed = state.speed[b, i]
     kind = bank.kind[model]
     power = bank.power[model]
-    if controller == Controller.PLACED or controller == Controller.TRAJECTORY:
+    is_scripted = int(0)
+    is_placed = controller == Controller.PLACED or controller == Controller.TRAJECTORY
+    if controller == Controller.SCRIPT:
+        rows = bank.script[e, i]
+        if rows[3] == 1 and state.active[b, i] == Presence.AWAKE:
+            is_scripted = 1
+            target_place = script.goal[b, i]
+            is_placed = rows[2] > 0
+    if is_placed:
         if controller == Controller.PLACED:
             target_place = place[b, i]
         distance = wp.length(wp.vec2(target_place[0] - pose[0], target_place[1] - pose[1]))
@@ -134,6 +143,8 @@ def move_one(
         desired_speed = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
         new_speed = speed + wp.clamp(desired_speed - speed, -change, change)
+        if is_scripted == 1:
+            new_speed = target_place[3]
         step_length = 0.5 * (speed + new_speed) * dt
         if controller == Controller.EXTERNAL:
             turned = pose[2] + wp.clamp(control[2], -1.0, 1.0) * WALKER_TURN * dt
@@ -142,6 +153,15 @@ def move_one(
         state.travelled[b, i] = state.travelled[b, i] + wp.abs(step_length)
         speed = new_speed
     elif power[2] > 0.0:
+        surface = bank.surface[e]
+        if is_scripted == 1:
+            # the speed is the script's: the pedals give this acceleration in the limits of nobody's engine and brakes
+            acceleration = (target_place[3] - speed) / dt
+            control = wp.vec4(0.0, 1.0, control[2], 0.0)
+            if acceleration > 0.0:
+                control = wp.vec4(1.0, 0.0, control[2], 0.0)
+            power = wp.vec4(wp.abs(acceleration), wp.abs(acceleration), 1.0e3, 0.0)
+            surface = wp.vec3(wp.abs(acceleration), surface[1], surface[2])
         if speed != 0.0 or control[0] > 0.0:
             result = bicycle(
                 pose,
@@ -151,7 +171,7 @@ def move_one(
                 control,
                 bank.body[model],
                 power,
-                bank.surface[e],
+                surface,
                 dt,
                 substeps,
             )
@@ -160,8 +180,11 @@ def move_one(
             state.travelled[b, i] = state.travelled[b, i] + distance
             pose = moved
             speed = result[3]
+            if is_scripted == 1:
+                speed = target_place[3]
+            else:
+                state.braking[b, i] = result[5]
             state.wheel[b, i] = result[4]
-            state.braking[b, i] = result[5]
     state.pose[b, i] = pose
     state.accel[b, i] = (speed - state.speed[b, i]) / dt
     state.speed[b, i] = speed
@@ -203,6 +226,7 @@ def move(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
+    script: ScriptState,
     action: wp.array2d(dtype=wp.vec4),
     place: wp.array2d(dtype=wp.vec4),
     agents: int,
@@ -217,4 +241,4 @@ def move(
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            move_one(bank, roads, state, action, place, b, i, dt, substeps)
+            move_one(bank, roads, state, script, action, place, b, i, dt, substeps)

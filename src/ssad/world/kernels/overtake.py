@@ -36,6 +36,8 @@ SPEED_UP = wp.constant(1.2)  # m/s^2 counted on while passing
 RAMP_TIME = wp.constant(3.0)  # s that a lane change takes
 RAMP_LEAST = wp.constant(2.2)  # its least length in lengths of the body
 PULL_OUT = wp.constant(5.0)  # m that are left to somebody who is going to be passed
+CLOSED_UP = wp.constant(0.1)  # m/s from the speed of its leader: who follows it at its distance
+STEADY = wp.constant(0.1)  # m/s^2 of whom nothing but its leader holds up
 APART = wp.constant(25.0)  # m between two who stand that are too few to come back between them
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -227,8 +229,12 @@ def way_is_clear(
     e: int,
     shift: wp.vec4,
     length: float,
+    advance: float,
 ) -> bool:
-    """Return whether i passes j without contact, on a path of `length` metres from its place, driven along it."""
+    """Return whether i passes j without contact, on a path of `length` metres from its place, driven along it.
+
+    advance: metres that j goes on meanwhile, for each metre of the path.
+    """
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
     own_body = bank.body[bank.model[e, i]]
@@ -238,7 +244,11 @@ def way_is_clear(
     for step in range(int(length) + 1):
         frame = way_frame(roads, route[0], route[1], shift, u0 + float(step))
         body = wp.vec3(frame[0], frame[1], wp.atan2(frame[3], frame[2]))
-        if boxes_touch(body, own_body[0] + 0.2, own_body[1] + 0.3, other_pose, other_half[0], other_half[1]):
+        moved = advance * float(step)
+        later_pose = wp.vec3(
+            other_pose[0] + moved * wp.cos(other_pose[2]), other_pose[1] + moved * wp.sin(other_pose[2]), other_pose[2]
+        )
+        if boxes_touch(body, own_body[0] + 0.2, own_body[1] + 0.3, later_pose, other_half[0], other_half[1]):
             clear = bool(False)
             break
     return clear
@@ -405,9 +415,15 @@ def choose_lane(
                 worth = worth and idm_gap(speed, wp.max(lane_gaps[1], 0.0), lane_gaps[0]) > FIRM
             if safe and worth:
                 shift_option = wp.vec4(u0, u0 + change_length, 0.0, share)
-                if not way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond):
+                if not way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond, 0.0):
                     shift_option = wp.vec4(u0, u0 + wp.max(shortest, 2.0 * speed), 0.0, share)
-                if way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond):
+                clear = way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond, 0.0)
+                steady = wp.abs(state.accel[b, i]) < STEADY and wp.abs(speed - other_speed) < CLOSED_UP
+                if not clear and not stands and steady and speed > 1.0:
+                    # who follows a creeping leader is too near to pass it where it is now, but it goes on
+                    advance = wp.min(other_speed / speed, 1.0)
+                    clear = way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond, advance)
+                if clear:
                     state.shift[b, i] = shift_option
                     decided = bool(True)
                 elif stands and speed < 0.3:

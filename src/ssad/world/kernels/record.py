@@ -254,7 +254,6 @@ def reset_agent(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int)
     state.control[b, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     state.progress[b, i] = 0
     state.phase[b, i] = 0
-    state.since[b, i] = 0
     state.travelled[b, i] = 0.0
     state.waited[b, i] = 0.0
     state.halted[b, i] = -1

@@ -54,6 +54,8 @@ IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
 FAR_SIGHT = wp.constant(120.0)  # m, of drivers of the population
+FAST = wp.constant(27.0)  # m/s: who aims for more than any town's limit looks as far as it needs to stop gently
+SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per squared speed
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
@@ -63,6 +65,15 @@ APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at c
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
+
+
+@wp.func
+def sight_range(cruise: float) -> float:
+    """Return how far an Autopilot looks along its route, m; cruise: the speed that it aims for, m/s."""
+    reach = SIGHT
+    if cruise > FAST:
+        reach = SIGHT_SHARE * cruise * cruise
+    return reach
 
 
 @wp.func
@@ -415,7 +426,8 @@ def cannot_meet(
 ) -> bool:
     """Return whether j's next seconds cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
 
-    lon, lat: place of j now; last_pose: its last one; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
+    last_pose: j's last one;
+    lon, lat: its place now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
     """
     dx = last_pose[0] - pose[0]
     dy = last_pose[1] - pose[1]
@@ -469,18 +481,21 @@ def scan_agents(
     state.aim[b, i] = wp.vec2(float(at) + offset, target)
     react = float(0.0)
 
+    sight = sight_range(state.cruise[b, i])
+    if style[0] > 0.0:
+        sight = wp.max(sight, FAR_SIGHT)
     signal_index = roads.path_signal[first]
     signal_now = int(SignalState.OFF)
-    if signal_index >= 0 and road_rule[1] - offset < SIGHT + 40.0:
+    if signal_index >= 0 and road_rule[1] - offset < sight + 40.0:
         signal_now = light(bank, roads, state, perceived, b, i, e, signal_index, dt)
     obeys = i > 0 or perceived.believes[b] == 0 or perceived.sign[b] == 1  # who does not know of a sign does not stop
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+        if line_gap > -0.5 and line_gap < sight + 20.0:
             react = stop_before(speed, line_gap + 1.0, style)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+        if line_gap > -0.5 and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
@@ -506,14 +521,13 @@ def scan_agents(
     # Range within which agents matter: 4 s of driving, and the distance of comfortable braking.
     extra = looks_longer(road_rule, offset, own_body[0], speed, style)
     travel = wp.max(target, speed) * STRIDE * float(HORIZON + extra)
-    sight = float(SIGHT)
-    if style[0] > 0.0:
-        sight = FAR_SIGHT
     view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), sight)
+    if sight > SIGHT and style[0] == 0.0:
+        view_range = wp.min(wp.max(view_range, SIGHT_SHARE * speed * speed), sight)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
     if is_changing_lane(shift):
-        bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - point[2]))
+        bend = bend + ASIDE + sight * wp.abs(wp.sin(pose[2] - point[2]))
     box_low = wp.vec2(pose[0], pose[1])
     box_high = box_low
     for corner in range(5):
@@ -657,11 +671,11 @@ def react_to_agents(
             if walks:
                 margin = 0.6
             bend = roads.bend[route[0] + state.progress[b, i]]
-            sight = float(SIGHT)
-            if style[0] > 0.0:
-                sight = FAR_SIGHT
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
+            sight = sight_range(state.cruise[b, i])
+            if style[0] > 0.0:
+                sight = wp.max(sight, FAR_SIGHT)
             leader = lead_gap(
                 roads,
                 perceived,

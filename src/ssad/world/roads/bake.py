@@ -1,14 +1,15 @@
-"""Conversion of OpenDRIVE to lane graphs."""
+"""Conversion of maps to lane graphs: OpenDRIVE here, Lanelet2 in `lanelet2_graph`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ssad.core.errors import MapError
 from ssad.core.import_report import ImportReport
@@ -16,9 +17,12 @@ from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
+from ssad.world.roads.graph_report import describe
 from ssad.world.roads.import_page import import_page, import_page_path
 from ssad.world.roads.lane_links import Key, LaneLinks
 from ssad.world.roads.lane_sampling import LaneSampler, LaneSamples
+from ssad.world.roads.lanelet2 import Lanelet2Options
+from ssad.world.roads.lanelet2_graph import bake_lanelet2
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
 from ssad.world.roads.thinning import thin
 from ssad.world.roads.xodr import MAX_BYTES, Lane, Network, local_coordinates, read_network
@@ -28,9 +32,8 @@ SHORT = 0.1  # m; shorter pieces of lane are passed over
 JOIN = 1.0  # m, most between the end of a lane and the start of its successor
 JOIN_MARGIN = 0.1  # m beyond half the width of a lane across which one that would end is joined
 WIDE = 100.0  # m; a wider lane is a mistake
-BESIDE = 0.5  # m between the end of a lane and an unlinked start that is worth a word
-SAME_WAY = 0.7  # cosine between two lanes of the same direction
 MAX_LANE_METRES = 5.0e6  # of all lanes: bounds the memory of the reader
+LANELET2 = ".osm"  # suffix of Lanelet2 maps
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
 
 Progress = Callable[[str], None]
@@ -47,23 +50,46 @@ class _Shape:
     s: F64
 
 
+@contextlib.contextmanager
+def _paused_collection() -> Iterator[None]:
+    """Pause the garbage collector, which would visit the millions of objects of a large map again and again."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@_paused_collection()
 def bake(
-    xodr: Path, name: str | None = None, *, report: ImportReport | None = None, progress: Progress | None = None
+    map_file: Path,
+    name: str | None = None,
+    *,
+    report: ImportReport | None = None,
+    progress: Progress | None = None,
+    lanelet2: Lanelet2Options | None = None,
 ) -> LaneGraph:
-    """Return the lane graph of an OpenDRIVE file.
+    """Return the lane graph of an OpenDRIVE file (.xodr) or a Lanelet2 map (.osm).
 
     Args:
-        xodr: The file.
+        map_file: The file.
         name: Name of the town; None: that of the file.
         report: Filled with what came in, what was left out, and what is doubtful.
         progress: Called with the name of each stage when it begins.
+        lanelet2: Origin, projection and rule of the road of a Lanelet2 map.
 
     Raises:
         MapError: The file is invalid.
     """
-    path = Path(xodr)
+    path = Path(map_file)
     account = ImportReport(str(path)) if report is None else report
     stage = progress or (lambda text: None)
+    stage(f"reading {path.name}")
+    if path.suffix == LANELET2:
+        return bake_lanelet2(path, name, options=lanelet2, report=account)
+    _refuse_options(path, lanelet2)
     network = read_network(path, account)
     keys = [
         (road.id, index, lane)
@@ -97,11 +123,12 @@ def import_map(
     strict: bool = False,
     turn_on_red: bool | None = None,
     progress: Progress | None = None,
+    lanelet2: Lanelet2Options | None = None,
 ) -> Path:
-    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically.
+    """Bake an OpenDRIVE file or a Lanelet2 map into HOME/towns/NAME.npz, atomically.
 
-    A copy of the file is stored beside it, with the coordinates of the town. A page with the report and a picture from
-    above is written to HOME/imports/NAME.html.
+    A copy of an OpenDRIVE file is stored beside it, with the coordinates of the town. A page with the report and a
+    picture from above is written to HOME/imports/NAME.html.
 
     Args:
         path: The file; a town that is baked already (.npz) is copied.
@@ -111,6 +138,7 @@ def import_map(
         strict: Refuse a file with doubts.
         turn_on_red: Turns to the near side are allowed on red; None: as the file suggests.
         progress: Called with the name of each stage when it begins.
+        lanelet2: Origin, projection and rule of the road of a Lanelet2 map.
 
     Returns:
         Path of the lane graph.
@@ -124,24 +152,37 @@ def import_map(
     target = Path(home) / "towns" / f"{town_name}.npz"
     account = ImportReport(str(path)) if report is None else report
     is_baked = Path(path).suffix == ".npz"
+    if is_baked:
+        _refuse_options(path, lanelet2)
     graph = (
         replace(load_graph(path), name=town_name)
         if is_baked
-        else bake(path, town_name, report=account, progress=progress)
+        else bake(path, town_name, report=account, progress=progress, lanelet2=lanelet2)
     )
     if strict:
         account.refuse_doubts(MapError)
     if turn_on_red is not None:
         graph = replace(graph, turn_on_red=np.array([turn_on_red]))
+    if progress:
+        progress(f"writing town {town_name}")
     source = Path(path).with_suffix(".xodr")
-    xodr_bytes = read_bytes(source, limit=MAX_BYTES) if source.is_file() else None
+    # An OpenDRIVE file of the same name beside a Lanelet2 map is another map.
+    has_source = source.is_file() and Path(path).suffix != LANELET2
+    xodr_bytes = read_bytes(source, limit=MAX_BYTES) if has_source else None
     save_graph(graph, target)
     if xodr_bytes is not None:
-        write_atomic(target.with_suffix(".xodr"), xodr_bytes if is_baked else local_coordinates(xodr_bytes))
+        has_shift = not is_baked and graph.origin.any()
+        write_atomic(target.with_suffix(".xodr"), local_coordinates(xodr_bytes) if has_shift else xodr_bytes)
     else:
         target.with_suffix(".xodr").unlink(missing_ok=True)  # remove the source of an earlier map of this name
     write_atomic(import_page_path(home, town_name), import_page(graph, account))
     return target
+
+
+def _refuse_options(path: Path, lanelet2: Lanelet2Options | None) -> None:
+    """Raise MapError for options of Lanelet2 maps with another file."""
+    if lanelet2 is not None:
+        raise MapError(f"{path}: --origin, --projection and --left-hand are for Lanelet2 maps (.osm)")
 
 
 def _shapes(network: Network, keys: list[Key], samples: LaneSamples, report: ImportReport) -> dict[Key, _Shape]:
@@ -264,38 +305,9 @@ def _assemble(
         left_hand=np.array([network.left_hand]),
         turn_on_red=np.array([network.turn_on_red]),
     )
-    _describe(graph, network, report)
+    roads = f"{len(network.roads)} roads, {len(network.junctions)} junctions"
+    describe(graph, roads, report, lambda lane: _name(graph, lane))
     return graph
-
-
-def _describe(graph: LaneGraph, network: Network, report: ImportReport) -> None:
-    """Add to a report what the graph holds, and the lanes that end beside an unlinked start."""
-    driving = graph.kind == LaneType.DRIVING
-    others = [
-        f"{count} {kind.name.lower()}"
-        for kind in LaneType
-        if kind not in (LaneType.DRIVING, LaneType.NONE) and (count := int((graph.kind == kind).sum()))
-    ]
-    kilometres = float(graph.length[driving].sum()) / 1000.0
-    report.contents += [
-        f"{len(network.roads)} roads, {len(network.junctions)} junctions",
-        f"{int(driving.sum())} drivable lanes of {kilometres:.2f} km{', ' if others else ''}{', '.join(others)}",
-        f"{int((~graph.signal_virtual).sum())} traffic lights, {len(graph.sign_kind)} signs,"
-        f" {len(graph.crosswalk_offset) - 1} crosswalks",
-    ]
-    lanes = np.flatnonzero(driving)
-    starts = lanes[np.diff(graph.pred_offset)[lanes] == 0]
-    if not len(starts):
-        return
-    start_points, end_points = graph.offset[:-1], graph.offset[1:] - 1
-    beside = cKDTree(graph.xy[start_points[starts]]).query_ball_point(graph.xy[end_points[lanes]], BESIDE)
-    for lane, rows in zip(lanes.tolist(), beside, strict=True):
-        for start in starts[rows].tolist():
-            turn = float(graph.yaw[start_points[start]] - graph.yaw[end_points[lane]])
-            if np.cos(turn) > SAME_WAY and start != lane:
-                report.doubt(
-                    "a lane ends beside an unlinked start", f"{_name(graph, lane)} beside {_name(graph, start)}"
-                )
 
 
 def _name(graph: LaneGraph, lane: int) -> str:

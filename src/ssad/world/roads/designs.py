@@ -303,6 +303,21 @@ def longreach() -> Town:
     )
 
 
+def high_speed_track() -> Town:
+    """Return an oval of 2 + 2 lanes without signals, for test protocols up to 40 m/s; 2,400 x 300 m.
+
+    Its southern straight runs along y = 0 for 2,120 m; opposing lanes lie side by side.
+    """
+
+    def track(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=2, width=3.5, shoulder=1.5, sidewalk=0.0, limit=90.0, radius=140.0)
+
+    west, east, depth = -200.0, 2200.0, 300.0
+    first, second = (500.0, depth), (1500.0, depth)
+    oval = track(second, (east, depth), (east, 0.0), (west, 0.0), (west, depth), first)
+    return Town("HighSpeedTrack", (oval, track(first, second)))
+
+
 DESIGNS: dict[str, Callable[[], Town]] = {
     "Twinford": twinford,
     "Crossgate": crossgate,
@@ -311,6 +326,7 @@ DESIGNS: dict[str, Callable[[], Town]] = {
     "Larkhill": larkhill,
     "Ringmere": ringmere,
     "Longreach": longreach,
+    "HighSpeedTrack": high_speed_track,
 }
 
 

@@ -30,7 +30,7 @@ def import_page_path(home: Path, town: str) -> Path:
 
 def import_page(graph: LaneGraph, report: ImportReport) -> str:
     """Return an HTML page on an imported map."""
-    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in report.lines())
+    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in report.lines(examples=None))
     key = ", ".join(
         f'<span style="background:{colour}">&emsp;</span> {kind.name.lower()}' for kind, colour in COLOURS.items()
     )
@@ -47,18 +47,17 @@ def picture(graph: LaneGraph) -> str:
     """Return an SVG of a town from above: lanes by kind, the direction of traffic, and unlinked ends and starts."""
     xy = graph.xy.astype(np.float64)
     low, high = xy.min(axis=0) - MARGIN, xy.max(axis=0) + MARGIN
-    size = high - low
+    size, corner = high - low, np.array([low[0], high[1]])
     pixel = float(size.max()) / WIDTH
     parts = []
     for kind, colour in COLOURS.items():
-        outlines = [_outline(graph, lane) for lane in np.flatnonzero(graph.kind == kind).tolist()]
-        data = " ".join(_path(outline, low, high) for outline in outlines)
+        data = " ".join(_path(_outline(graph, lane) - corner) for lane in np.flatnonzero(graph.kind == kind).tolist())
         if data:
             parts.append(f'<path fill="{colour}" stroke="#fff" stroke-width="{0.3 * pixel:.3f}" d="{data}"/>')
     driving = np.flatnonzero(graph.kind == LaneType.DRIVING)
     wedge = max(0.8, 3.0 * pixel)
     wedges = [_wedge(graph, lane, wedge) for lane in driving.tolist()]
-    parts.append(f'<path fill="#fff" d="{" ".join(_path(shape, low, high) for shape in wedges)}"/>')
+    parts.append(f'<path fill="#fff" d="{" ".join(_path(shape - corner) for shape in wedges)}"/>')
     ends = driving[np.diff(graph.succ_offset)[driving] == 0]
     starts = driving[np.diff(graph.pred_offset)[driving] == 0]
     for lanes, points, colour in ((ends, graph.offset[1:] - 1, "#d22"), (starts, graph.offset[:-1], "#26c")):
@@ -90,7 +89,7 @@ def _wedge(graph: LaneGraph, lane: int, size: float) -> F64:
     return np.stack([middle + forward, middle - forward + left, middle - forward - left])
 
 
-def _path(outline: F64, low: F64, high: F64) -> str:
-    """Return the SVG path of a polygon; y points down in an SVG."""
-    points = " ".join(f"{x - low[0]:.2f},{high[1] - y:.2f}" for x, y in outline.tolist())
-    return f"M{points}Z"
+def _path(outline: F64) -> str:
+    """Return the SVG path of a polygon [., 2] from the upper left corner; y points down in an SVG."""
+    numbers = (outline * [1.0, -1.0]).ravel().tolist()
+    return f"M{('%.2f,%.2f ' * len(outline) % tuple(numbers)).rstrip()}Z"

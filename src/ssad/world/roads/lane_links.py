@@ -40,6 +40,7 @@ class LaneLinks:
             for end, link in ((0, road.predecessor), (1, road.successor)):
                 if link and link.kind == "road":
                     self._road(road, end, link)
+                    self._road_back(road, end, link)
         for number, connections in network.junctions.items():
             for connection in connections:
                 self._connection(number, connection)
@@ -79,6 +80,15 @@ class LaneLinks:
             for target in lane.successors if end else lane.predecessors:
                 for other in self._ends_of(link, target, self.ends[road.id][end]):
                     self._join(((road.id, section, lane.id), end), other)
+
+    def _road_back(self, road: MapRoad, end: int, link: Link) -> None:
+        """Join the lanes that the other road of a link names, where that road itself says nothing of the link."""
+        if link.s is not None:
+            return
+        other = self.network.roads[link.id]
+        contact = self._contact(other, link.contact, self.ends[road.id][end])
+        if (other.predecessor, other.successor)[contact] is None:
+            self._road(other, contact, Link("road", road.id, "end" if end else "start"))
 
     def _ends_of(self, link: Link, lane: int, place: F64) -> Iterator[End]:
         """Yield the ends of a lane of a road that a link reaches."""

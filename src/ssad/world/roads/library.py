@@ -10,12 +10,15 @@ from pathlib import Path
 from ssad.core.errors import MapError, unknown_name
 from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.safeio import home_folder, read_text
-from ssad.world.roads.bake import bake
+from ssad.world.roads.bake import LANELET2, bake
 from ssad.world.roads.random_towns import RANDOM, write_random_town
 from ssad.world.roads.signals import signal_names
-from ssad.world.roads.xodr import MAX_BYTES, read_network
+from ssad.world.roads.xodr import MAX_BYTES, Network, read_network
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
+BUILT_IN = (
+    *("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach"),
+    "HighSpeedTrack",
+)
 
 
 def town_names() -> dict[str, str]:
@@ -32,7 +35,7 @@ def is_town(name: str) -> bool:
 
 
 def load_town(name: str) -> LaneGraph:
-    """Return the lane graph of a town by its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
+    """Return the lane graph of a town by its name, or the path of a baked town (.npz) or a map (.xodr, .osm).
 
     A graph is immutable and cached. UnknownNameError lists the closest names; MapError describes the problem of a
     file.
@@ -44,10 +47,10 @@ def load_town(name: str) -> LaneGraph:
         return _stored(str(path), path.stat().st_mtime_ns)
     if RANDOM.fullmatch(name):
         return _random(name)
-    if Path(name).suffix == ".xodr":
+    if Path(name).suffix in (".xodr", LANELET2):
         return bake(Path(name))
     if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
-        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr)")
+        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr, .osm)")
     raise unknown_name("town", name, town_names())
 
 
@@ -70,13 +73,23 @@ def town_xodr(name: str) -> str:
     return read_text(path, limit=MAX_BYTES)
 
 
+def town_network(name: str) -> Network:
+    """Return the OpenDRIVE network of a town, in the coordinates of its lane graph; MapError as `town_xodr`."""
+    return _network(town_xodr(name))
+
+
+@lru_cache(maxsize=4)
+def _network(xodr: str) -> Network:
+    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
+        path = Path(folder) / "map.xodr"
+        path.write_text(xodr, encoding="utf-8")
+        return read_network(path)
+
+
 @lru_cache(maxsize=8)
 def town_signals(name: str) -> dict[int, str]:
     """Return the OpenDRIVE id of each signal of a town; MapError as `town_xodr`."""
-    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
-        path = Path(folder) / "map.xodr"
-        path.write_text(town_xodr(name), encoding="utf-8")
-        return signal_names(load_town(name), read_network(path))
+    return signal_names(load_town(name), town_network(name))
 
 
 @lru_cache(maxsize=8)

@@ -51,6 +51,8 @@ SIGNS: Final = {
     ("se", "b1"): SignKind.YIELD,
     ("jp", "330-a"): SignKind.STOP,
 }
+# Usual limits outside towns, m/s, where a map states the type of a road and no limit (Germany: 130, 100 km/h).
+TYPE_SPEEDS: Final = {"motorway": 130.0 / 3.6, "rural": 100.0 / 3.6, "lowSpeed": 30.0 / 3.6}
 SPEED_SIGNS: Final = {("", "274"): 1.0 / 3.6, ("us", "r2-1"): 0.44704, ("at", "52-10a"): 1.0 / 3.6}  # default unit
 STOP_LINES: Final = {("", "294"), ("at", "haltelinie")}
 COUNTRIES: Final = {
@@ -521,11 +523,11 @@ class _Reader:
             )
         elif shape.tag == "paramPoly3":
             kind = CURVE
-            range_name = shape.get("pRange", "normalized")
-            if range_name not in ("arcLength", "normalized"):
+            range_name = shape.get("pRange", "normalized").strip().lower()
+            if range_name not in ("arclength", "normalized"):
                 self.report.doubt("pRange is neither arcLength nor normalized; normalized is taken", location)
             coefficients = [f"{letter}{axis}" for axis in "UV" for letter in "abcd"]
-            end = length if range_name == "arcLength" else 1.0
+            end = length if range_name == "arclength" else 1.0
             numbers = [self.number(shape, name, location, limit=MAX_COEFFICIENT) for name in coefficients]
             values = (*numbers, max(end, 1e-9))
         if kind == CLOTHOID and max(map(abs, values)) * length > MAX_TURN:
@@ -570,6 +572,8 @@ class _Reader:
             if is_missing:
                 self.report.doubt("a road is linked to a junction that the map lacks; it ends there", f"road {road.id}")
             links.append(None if is_missing else link)
+        if road.junction >= 0 and road.junction not in junctions:
+            self.report.doubt("a road belongs to a junction that the map lacks", f"road {road.id}")
         return replace(road, predecessor=links[0], successor=links[1])
 
     def connections(self, junction: Element, location: str) -> Iterator[Connection]:
@@ -635,7 +639,7 @@ class _Reader:
         return tuple(result)
 
     def speed_limits(self, road: Element, location: str) -> list[tuple[float, float | None]]:
-        """Return positions and limits of a road, m/s: of its types, or of its signs if no type has one."""
+        """Return positions and limits of a road, m/s: of its types, of its signs if no type has one, or as usual."""
         limits = []
         for road_type in road.findall("type"):
             speed = road_type.find("speed")
@@ -654,7 +658,14 @@ class _Reader:
                 limits.append(
                     (0.0 if signal.get("orientation") == "-" else self.number(signal, "s", location), value * unit)
                 )
-        return sorted(limits, key=lambda limit: limit[0])
+        if limits:
+            return sorted(limits, key=lambda limit: limit[0])
+        types = [
+            (self.number(road_type, "s", location), road_type.get("type", "")) for road_type in road.findall("type")
+        ]
+        return (
+            [(s, TYPE_SPEEDS.get(kind)) for s, kind in types] if any(kind in TYPE_SPEEDS for _, kind in types) else []
+        )
 
     def lane(self, element: Element, number: int, mark: Marking, location: str, *, left_hand: bool) -> Lane:
         place = f"{location}, lane {number}"
@@ -843,12 +854,15 @@ def local_coordinates(xodr: bytes) -> bytes:
 
 
 def _without_namespace(root: Element) -> Element:
-    """Return a tree with the namespace of its root removed from its tags."""
-    namespace, brace, _ = root.tag.rpartition("}")
-    if brace:
+    """Return a tree with the namespaces of its root and of its roads and junctions removed from its tags."""
+    tags = [element.tag for element in (root, *root) if isinstance(element.tag, str)]
+    names = ("OpenDRIVE", "header", "road", "junction", "controller")
+    prefixes = {tag.removesuffix(name) for tag in tags for name in names if tag.endswith(f"}}{name}")}
+    if prefixes:
         for element in root.iter():
             if isinstance(element.tag, str):
-                element.tag = element.tag.removeprefix(f"{namespace}}}")
+                namespace, brace, name = element.tag.rpartition("}")
+                element.tag = name if namespace + brace in prefixes else element.tag
     return root
 
 

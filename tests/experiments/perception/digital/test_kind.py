@@ -567,7 +567,8 @@ def test_the_papers_table_is_the_papers(data_dir: Path) -> None:
 def test_every_attack_is_compared_with_the_reference_ensemble(root: Path, tmp_path: Path) -> None:
     weak = "helpers.weak_attacks:"
     names = ["fgsm", *({"name": name, "options": {"steps": 3}} for name in ("pgd", f"{weak}FlippedChannel"))]
-    suite = suite_of(root, detectors=[LINEAR], attacks=[*names, "square"], sweeps=[], steps=3, replicates=2)
+    names.append({"name": "square", "options": {"queries": 20}})  # the thousand of its default prove nothing more
+    suite = suite_of(root, detectors=[LINEAR], attacks=names, sweeps=[], steps=3, replicates=2)
     records = {record["attack"]: record for record in run_digital(Digital().plan(suite), tmp_path / "run")}
     for attack in ("fgsm", "pgd", f"{weak}FlippedChannel"):
         compared = records[attack]["references"]

@@ -398,6 +398,7 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert np.array_equal(attacks_of(job).texture(spec).make(), colour), "trained anew, the same to the bit"
 
 
+@pytest.mark.slow  # test_optimise.py shows a small one whole pictures with their cameras
 def test_a_texture_is_trained_against_a_3d_detector(tmp_path: Path) -> None:
     """It is shown whole pictures with their camera, whatever the window; its loss on them rises."""
     given = suite(

@@ -69,8 +69,10 @@ class Parameter:
         return f"{value:g} is outside {low:g} to {high:g}{unit} ({self.doc})"
 
 
+MAX_EGO_SPEED = 40.0  # m/s
+
 EGO_START: tuple[Parameter, ...] = (
-    Parameter("ego_speed", 0.0, 15.0, 0.0, "m/s", "speed of the ego at the start", spread=2.0),
+    Parameter("ego_speed", 0.0, 15.0, 0.0, "m/s", "speed of the ego at the start", 2.0, (0.0, MAX_EGO_SPEED)),
     Parameter("ego_longitudinal", 0.0, 10.0, 0.0, "m", "from the start of the route along it to the ego", spread=4.0),
     Parameter("ego_lateral", -1.0, 1.0, 0.0, "m", "ego to the left of its route", spread=0.375),
     Parameter("ego_heading", -0.2, 0.2, 0.0, "rad", "turn of the ego to the left of its route", spread=0.03),

@@ -313,7 +313,7 @@ def scripted_agent(
         model=body,
         controller=Controller.SCRIPT,
         pose=pose,
-        target_speed=max(phase.speed for phase in phases),
+        target_speed=max(phase.speed or 0.0 for phase in phases),
         phases=tuple(phases),
         route=route,
     )

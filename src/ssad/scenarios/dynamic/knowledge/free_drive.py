@@ -55,7 +55,7 @@ SCENARIO = ScenarioType(
     nhtsa="The ego drives a route among random traffic.",
     build=build,
     parameters=(
-        Parameter("speed", 3.0, 15.0, 8.0, "m/s", "mean speed that the vehicles want"),
+        Parameter("speed", 3.0, 15.0, 8.0, "m/s", "mean speed that the vehicles want", allowed=(3.0, 40.0)),
         Parameter("speed_spread", 0.0, 3.0, 1.5, "m/s", "half range of the speeds that they want"),
     ),
     whole_town=True,

@@ -14,14 +14,22 @@ from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import F64, Episode, Scenario
 from ssad.scenarios.dynamic.catalogue import scenario_type
-from ssad.scenarios.dynamic.sampling import TARGET_SPEED
+from ssad.scenarios.dynamic.parameters import (
+    TARGET_SPEED,
+    is_derived,
+    parameter_values,
+    scenario_parameters,
+    violated_constraint,
+    with_parameters,
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class ParameterBox:
-    """Search space of a scenario: the parameters of its class over their full ranges.
+    """Search space of a scenario: the parameters of its class, and those that it declares, over their full ranges.
 
-    The ego's start and target speed are fixed: a generator chooses what other agents do.
+    The ego's start and target speed are fixed, unless the scenario declares a parameter for them: a generator chooses
+    what other agents do. What follows from other parameters by an expression is not searched.
 
     Attributes:
         scenario: The nominal scenario.
@@ -36,18 +44,23 @@ class ParameterBox:
         """Return the box of a scenario.
 
         Raises:
-            ConfigError: Its class has no parameters.
+            ConfigError: It has no parameters with a range.
         """
-        scenario_kind = scenario_type(scenario.type)
+        class_names = {
+            parameter.name for parameter in scenario_type(scenario.type).parameters if parameter.name != TARGET_SPEED
+        }
+        declared_names = {name for name, declaration in scenario.declared.items() if declaration.range is not None}
         ranges = {
-            parameter.name: (parameter.low, parameter.high)
-            for parameter in scenario_kind.parameters
-            if parameter.high > parameter.low and parameter.name != TARGET_SPEED
+            name: (parameter.low, parameter.high)
+            for name, parameter in scenario_parameters(scenario).items()
+            if parameter.high > parameter.low
+            and (name in declared_names or (name in class_names and not is_derived(scenario, name)))
         }
         if not ranges:
             raise ConfigError(
                 f"scenario {scenario.name}: its type {scenario.type} has no parameters of other agents to search; "
-                "take one of another type, or the generators king and cat"
+                "declare some with a range (docs/how-to/sweep-parameters.md), take a scenario of another type, or the "
+                "generators king and cat"
             )
         return cls(scenario, ranges)
 
@@ -58,7 +71,7 @@ class ParameterBox:
 
     def nominal(self) -> F64:
         """Return the scenario's own values as a point of the unit cube, clipped to the box."""
-        nominal_values = scenario_type(self.scenario.type).values(self.scenario.parameters)
+        nominal_values = parameter_values(self.scenario)
         shares: F64 = np.array(
             [(nominal_values[name] - low) / (high - low) for name, (low, high) in self.ranges.items()]
         )
@@ -72,7 +85,11 @@ class ParameterBox:
             name: min(max(round(low + share * (high - low), 6), low), high)
             for share, (name, (low, high)) in zip(shares, self.ranges.items(), strict=True)
         }
-        return dataclasses.replace(self.scenario, parameters={**self.scenario.parameters, **values})
+        return with_parameters(self.scenario, values)
+
+    def is_feasible(self, point: npt.ArrayLike) -> bool:
+        """Return whether the scenario at a point of the unit cube meets its constraints."""
+        return violated_constraint(self.scenario_at(point)) is None
 
 
 class BoxSearch(ABC):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 import numpy as np
 
+from ssad.core.errors import ConfigError
 from ssad.core.generators import Base
 from ssad.core.seeding import generator, seed32
 from ssad.core.types import F64
-from ssad.scenarios.dynamic.search.box import BoxSearch
+from ssad.scenarios.dynamic.search.box import BoxSearch, ParameterBox
+
+_DRAWS: Final = 1000  # batches of points after which the constraints count as impossible
 
 
 class RandomSearch(BoxSearch):
@@ -24,15 +27,16 @@ class RandomSearch(BoxSearch):
         self._random = [generator("random search", seed) for seed in seeds]
 
     def points(self, index: int, count: int) -> F64:
-        """Return the next random points."""
-        return self._random[index].random((count, self.boxes[index].dimension))
+        """Return the next random points that meet the constraints."""
+        box = self.boxes[index]
+        return feasible_points(box, count, lambda missing: self._random[index].random((missing, box.dimension)))
 
 
 class GridSearch(BoxSearch):
     """Centres of equal grid cells, as many along each parameter as the budget allows, in random order.
 
     The first parameters get one cell more where the budget allows it. The random order makes an interrupted search a
-    sample of the whole grid instead of one corner.
+    sample of the whole grid instead of one corner. Cells that violate a constraint of the scenario are left out.
     """
 
     name = "grid"
@@ -44,6 +48,8 @@ class GridSearch(BoxSearch):
             counts = _counts(budget, box.dimension)
             axes = np.meshgrid(*((np.arange(cell_count) + 0.5) / cell_count for cell_count in counts), indexing="ij")
             cells = np.stack([axis.ravel() for axis in axes], 1)
+            if box.scenario.constraints:
+                cells = cells[[box.is_feasible(cell) for cell in cells]]
             self._cells.append(cells[generator("grid search", seed).permutation(len(cells))])
         self._next = [0] * len(self.boxes)
 
@@ -69,8 +75,32 @@ class HaltonSearch(BoxSearch):
         ]
 
     def points(self, index: int, count: int) -> F64:
-        """Return the next points of the sequence."""
-        return np.asarray(self._sequences[index].random(count))
+        """Return the next points of the sequence that meet the constraints."""
+        return feasible_points(self.boxes[index], count, self._sequences[index].random)
+
+
+def feasible_points(box: ParameterBox, count: int, draw: Callable[[int], F64]) -> F64:
+    """Return the next drawn points [count, D] that meet the constraints of a scenario.
+
+    Args:
+        box: Search space of the scenario.
+        count: Number of points.
+        draw: Function that returns the next points [n, D] of the unit cube.
+
+    Raises:
+        ConfigError: Hardly any point meets the constraints.
+    """
+    points = np.asarray(draw(count), np.float64)
+    if not box.scenario.constraints:
+        return points
+    feasible = [point for point in points if box.is_feasible(point)]
+    for _ in range(_DRAWS):
+        if len(feasible) == count:
+            return np.array(feasible)
+        feasible += [point for point in draw(count - len(feasible)) if box.is_feasible(point)]
+    raise ConfigError(
+        f"scenario {box.scenario.name}: constraints: hardly any point of the ranges meets them; narrow the ranges"
+    )
 
 
 def _counts(budget: int, dimension: int) -> list[int]:

@@ -17,7 +17,7 @@ from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingO
 from ssad.core.image_files import read_image_file
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.types import F32, F64, U8
-from ssad.datasets.nuscenes.files import read_frame_image, read_points
+from ssad.datasets.nuscenes.files import read_frame_image, read_frame_points
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 from ssad.scenarios.static.shifts import (
     ShiftSpec,
@@ -162,7 +162,7 @@ class SceneShifter:
             FormatError: The sweep cannot be read.
         """
         if frame.token not in self._clouds:
-            self._clouds[frame.token] = read_points(self.root / frame.filename)
+            self._clouds[frame.token] = read_frame_points(self.root, frame)
             self._clouds[frame.token].setflags(write=False)
             while len(self._clouds) > 4:
                 self._clouds.popitem(last=False)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ssad.core import safeio
@@ -23,7 +22,12 @@ from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.physical.lights import Projector, TargetSize, make_light
 from ssad.scenarios.static.physical.textures.controls import texture_picture
-from ssad.scenarios.static.physical.textures.export import PrintedTexture, load_printed_texture
+from ssad.scenarios.static.physical.textures.export import (
+    PrintedTexture,
+    check_description,
+    colour_tensor,
+    load_printed_texture,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +79,9 @@ class LightSetup:
         return AgentEdit(self.edit, car, agent)
 
 
+_ANY_SIZE = TargetSize(4.9, 2.06, 1.51)
+
+
 def export_light(out: Path, light: LightSetup, *, name: str = "") -> list[Path]:
     """Write a light attack: light.json, and for a projector its picture as picture.png and, exactly, picture.npz.
 
@@ -121,11 +128,14 @@ def load_light(folder: Path) -> LightSetup:
     """
     description, colour = safeio.read_json(folder / "light.json"), None
     try:
+        check_description(description, attack=str, options=dict, hour=str, target=str, values=dict)
+        if not all(isinstance(value, int | float) for value in description["values"].values()):
+            raise TypeError("values are not numbers")
         if "sha256" in description:
             colour_bytes = safeio.read_bytes(folder / "picture.npz")
             if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
                 raise FormatError(f"{folder / 'picture.npz'}: not what light.json describes; export it again")
-            colour = torch.from_numpy(safeio.load_npz(folder / "picture.npz")["colour"].copy())
+            colour = colour_tensor(safeio.load_npz(folder / "picture.npz")["colour"])
         light = LightSetup(
             description["attack"],
             description["options"],
@@ -134,9 +144,19 @@ def load_light(folder: Path) -> LightSetup:
             description["values"],
             colour,
         )
-        # Both calls only validate: a bad name should fail here, not in the middle of a drive.
-        make_light(light.attack, light.options)
+        # These only validate: a bad name should fail here, not in the middle of a drive.
+        if ":" in light.attack:
+            raise FormatError(
+                f"{folder / 'light.json'}: the attack {light.attack[:80]} is code, which a file must not name; install "
+                "it as an entry point of ssad.lights"
+            )
+        device = make_light(light.attack, light.options)
         at_hour(SceneWeather(), light.hour)
+        parse_target(light.target)
+        if not isinstance(device, Projector):
+            missing = sorted(device.ranges(_ANY_SIZE).keys() - light.values.keys())
+            if missing:
+                raise KeyError(f"values lack {', '.join(missing)}")
         return light
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'light.json'}: no exported light ({error}); export it again") from None

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
@@ -85,12 +86,27 @@ def load_printed_texture(folder: Path) -> PrintedTexture:
     """
     description, colour_bytes = safeio.read_json(folder / "texture.json"), safeio.read_bytes(folder / "texture.npz")
     try:
+        check_description(description, sha256=str, carrier=str, options=dict, target=str)
         if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
             raise FormatError(f"{folder / 'texture.npz'}: not the texture that texture.json describes; export it again")
-        colour = torch.from_numpy(safeio.load_npz(folder / "texture.npz")["colour"].copy())
+        colour = colour_tensor(safeio.load_npz(folder / "texture.npz")["colour"])
         return PrintedTexture(colour, description["carrier"], description["options"], description["target"])
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'texture.json'}: no exported texture ({error}); export it again") from None
+
+
+def check_description(description: Any, **types: type) -> None:
+    """Raise KeyError or TypeError if the description of an export lacks a field, or has one of another type."""
+    for name, field_type in types.items():
+        if not isinstance(description[name], field_type):
+            raise TypeError(f"{name} is {str(description[name])[:40]!r}")
+
+
+def colour_tensor(colour: npt.NDArray[Any]) -> Tensor:
+    """Return the colours [3, H, W] of an export. TypeError if they are others than finite numbers of that shape."""
+    if colour.ndim != 3 or len(colour) != 3 or colour.dtype.kind != "f" or not np.isfinite(colour).all():
+        raise TypeError("colour is no picture")
+    return torch.from_numpy(colour.astype(np.float32))
 
 
 def export_texture(out: Path, texture: PrintedTexture, *, dots: int = 1000, name: str = "") -> list[Path]:

@@ -1,0 +1,347 @@
+"""OpenSCENARIO documents with their parameters, expressions and catalogues put in; errors name file and line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from xml.etree.ElementTree import Element
+
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.expressions import evaluate, number_or_text, text_of
+from ssad.core.safeio import MIB, read_xml
+
+MAX_BYTES: Final = 64 * MIB
+MAX_CATALOGUES: Final = 200  # files of a folder
+MAX_NESTED: Final = 8  # catalogue entries in catalogue entries
+MAX_ELEMENTS: Final = 1_000_000  # of a document with its catalogue entries
+BODIES: Final = ("Vehicle", "Pedestrian", "MiscObject")
+_NAME = re.compile(r"\$\{?\s*([^\W\d][\w.]*)\s*\}?")
+_EXPRESSION = re.compile(r"\$\{(.*)\}", re.DOTALL)
+# Some tools write the constants of expressions as parameters.
+_CONSTANTS: Final = {"pi": repr(math.pi)}
+# Names of declarations, which some files write with the $ of a reference.
+_DECLARED: Final = ("parameterRef", "variableRef", "parameterName")
+_RULES: Final = {
+    "equalTo": lambda value, limit: value == limit,
+    "notEqualTo": lambda value, limit: value != limit,
+    "greaterThan": lambda value, limit: value > limit,
+    "greaterOrEqual": lambda value, limit: value >= limit,
+    "lessThan": lambda value, limit: value < limit,
+    "lessOrEqual": lambda value, limit: value <= limit,
+}
+
+
+class LineElement(Element):
+    """Element of a document with the file and the line that it comes from."""
+
+    def __init__(self, tag: str, attrib: dict[str, str], line: int = 0, source: str = "") -> None:
+        super().__init__(tag.rpartition("}")[2], attrib)
+        self.line, self.source = line, source
+
+
+class ConstraintError(FormatError):
+    """A parameter has a value that its declaration excludes."""
+
+
+def read_document(path: Path) -> Element:
+    """Read the root of a file, unresolved. FormatError if it is no OpenSCENARIO XML."""
+    root = read_xml(
+        path,
+        limit=MAX_BYTES,
+        element_factory=lambda tag, attributes, line: LineElement(tag, attributes, line, str(path)),
+    )
+    if root.tag != "OpenSCENARIO":
+        raise FormatError(f"{path}: not OpenSCENARIO XML: its root is <{root.tag[:40]}>")
+    return root
+
+
+def error_at(element: Element, message: str, kind: type[FormatError] = FormatError) -> FormatError:
+    """Return an error that names the file, the line and the tag of an element."""
+    source, line = getattr(element, "source", ""), getattr(element, "line", 0)
+    place = f"{source}:{line}: " if source else ""
+    return kind(f"{place}{element.tag}: {message}")
+
+
+class AttributeReader:
+    """Attributes of a resolved document; errors name file, line and element."""
+
+    def __init__(self, location: str) -> None:
+        self.location = location
+
+    def error(self, element: Element | str, message: str) -> FormatError:
+        """Return a FormatError that names the file and the element."""
+        if isinstance(element, LineElement):
+            return error_at(element, message)
+        tag = element if isinstance(element, str) else element.tag
+        return FormatError(f"{self.location}: {tag}: {message}")
+
+    def text(self, element: Element, name: str, default: str | None = None) -> str:
+        """Return an attribute as text. FormatError if it is missing and there is no default."""
+        value = element.get(name, default)
+        if value is None:
+            raise self.error(element, f"attribute '{name}' is missing")
+        return value
+
+    def number(self, element: Element, name: str, default: float | None = None) -> float:
+        """Return an attribute as a finite number. FormatError if it is none."""
+        number_text = self.text(element, name, None if default is None else repr(default))
+        try:
+            value = float(number_text)
+        except ValueError:
+            raise self.error(element, f"{name} is '{number_text[:40]}', not a number") from None
+        if not math.isfinite(value):
+            raise self.error(element, f"{name} is '{number_text[:40]}', not a finite number")
+        return value
+
+    def truth(self, element: Element, name: str, *, default: bool) -> bool:
+        """Return an attribute as a truth value. FormatError if it is none."""
+        text = self.text(element, name, "true" if default else "false").strip()
+        if text not in ("true", "false", "1", "0"):
+            raise self.error(element, f"{name} is '{text[:40]}', not true or false")
+        return text in ("true", "1")
+
+    def lanes(self, element: Element, name: str) -> int:
+        """Return a number of lanes to the left, negative to the right. FormatError where no road has as many."""
+        value = self.number(element, name, 0.0)
+        if abs(value) > MAX_LANES:
+            raise self.error(element, f"{name} is {value:g}: no road has so many lanes")
+        return int(value)
+
+
+MAX_LANES: Final = 20
+
+
+@dataclass
+class Scope:
+    """Parameters that a part of a document knows.
+
+    Attributes:
+        declarations: Declaration of each name.
+        assigned: Values that take the place of declared ones.
+        parent: Scope around it.
+    """
+
+    declarations: Mapping[str, Element] = field(default_factory=dict)
+    assigned: Mapping[str, str] = field(default_factory=dict)
+    parent: Scope | None = None
+    _values: dict[str, str] = field(default_factory=dict)
+    _open: list[str] = field(default_factory=list)
+
+    def value(self, name: str) -> str:
+        """Return the value of a parameter. KeyError if it is not declared, FormatError if it depends on itself."""
+        if name in self._values:
+            return self._values[name]
+        if name not in self.declarations:
+            if self.parent is not None:
+                return self.parent.value(name)
+            if name in _CONSTANTS:
+                return _CONSTANTS[name]
+            raise KeyError(name)
+        declaration = self.declarations[name]
+        if name in self._open:
+            ring = " -> ".join([*self._open[self._open.index(name) :], name])
+            raise error_at(declaration, f"the parameter depends on itself: {ring[:200]}")
+        self._open.append(name)
+        try:
+            text = self.assigned.get(name)
+            self._values[name] = self.text(declaration, "value", declaration.get("value", "")) if text is None else text
+        finally:
+            self._open.pop()
+        return self._values[name]
+
+    def text(self, element: Element, name: str, raw: str) -> str:
+        """Return an attribute with its parameter or expression put in. FormatError if it has no value."""
+        if "$" not in raw:
+            return raw
+        if name in _DECLARED:
+            return raw.removeprefix("$")
+        stripped = raw.strip()
+        if stripped.startswith("\\$"):
+            return stripped[1:]
+        if reference := _NAME.fullmatch(stripped):
+            try:
+                return self.value(reference[1])
+            except KeyError:
+                raise error_at(element, f"{name}: parameter ${reference[1]} is not declared") from None
+        expression = _EXPRESSION.fullmatch(stripped)
+        if expression is None:
+            if stripped.startswith("$"):
+                raise error_at(element, f"{name}: '{raw[:60]}' is neither $parameter nor ${{expression}}")
+            return raw
+        try:
+            return text_of(evaluate(expression[1], self.value))
+        except ConfigError as error:
+            joined = self._joined_text(expression[1]) if name == "name" or name.endswith("Ref") else None
+            if joined is None:
+                raise error_at(element, f"{name}: {error}") from None
+            return joined
+
+    def _joined_text(self, expression: str) -> str | None:
+        """Return the texts and parameters that + joins, as some tools name elements; None if it is no such text."""
+        parts = [part.strip() for part in expression.split("+")]
+        texts = []
+        for part in parts:
+            reference = _NAME.fullmatch(part)
+            if reference is None and not re.fullmatch(r"[\w ]+", part):
+                return None
+            try:
+                texts.append(self.value(reference[1]) if reference else part)
+            except KeyError:
+                return None
+        return "".join(texts)
+
+    def check(self) -> None:
+        """Evaluate all parameters. ConstraintError where none of a parameter's groups of constraints holds."""
+        for name, declaration in self.declarations.items():
+            value = number_or_text(self.value(name))
+            groups = declaration.findall("ConstraintGroup")
+            limits = [
+                [(rule.get("rule", ""), self.text(rule, "value", rule.get("value", ""))) for rule in group]
+                for group in groups
+            ]
+            if groups and not any(all(_holds(value, *limit) for limit in group) for group in limits):
+                stated = " or ".join(" and ".join(f"{rule} {limit}" for rule, limit in group) for group in limits)
+                raise error_at(
+                    declaration, f"parameter '{name}' is {text_of(value)}, but must be {stated[:200]}", ConstraintError
+                )
+
+
+def _holds(value: float | bool | str, rule: str, limit_text: str) -> bool:
+    limit = number_or_text(limit_text)
+    if isinstance(value, str) != isinstance(limit, str):
+        return rule == "notEqualTo"
+    return rule in _RULES and bool(_RULES[rule](value, limit))
+
+
+def resolve(root: Element, path: Path, assigned: Mapping[str, str] | None = None) -> tuple[Element, dict[str, str]]:
+    """Return a document with parameters, expressions and catalogue entries put in.
+
+    Args:
+        root: The document, of `read_document`.
+        path: Its file; catalogues lie relative to it.
+        assigned: Values that take the place of those that the document declares.
+
+    Returns:
+        The document without declarations and references, and the values of its parameters.
+
+    Raises:
+        FormatError: A parameter is not declared or depends on itself, an expression has no value, or a catalogue entry
+            does not exist.
+        ConstraintError: A parameter has a value that its declaration excludes.
+    """
+    declarations = _declarations(root)
+    for name in assigned or {}:
+        if name not in declarations:
+            known = ", ".join(declarations) or "none"
+            raise FormatError(f"{path}: it declares no parameter '{name[:60]}' that could be set; declared: {known}")
+    scope = Scope(declarations, assigned or {})
+    scope.check()
+    resolver = _Resolver(_Catalogues(root, path, scope))
+    resolved = resolver.copy(root, scope, declare=False)
+    return resolved, {name: scope.value(name) for name in declarations}
+
+
+def _declarations(element: Element) -> dict[str, Element]:
+    return {item.get("name", "").removeprefix("$"): item for item in element.iterfind("ParameterDeclarations/*")}
+
+
+class _Resolver:
+    """Copies of elements with everything put in."""
+
+    def __init__(self, catalogues: _Catalogues) -> None:
+        self.catalogues = catalogues
+        self.count = 0
+
+    def copy(self, element: Element, scope: Scope, *, declare: bool = True, depth: int = 0) -> LineElement:
+        """Return the resolved copy of an element."""
+        self.count += 1
+        if self.count > MAX_ELEMENTS:
+            raise error_at(element, f"the document has more than {MAX_ELEMENTS} elements with its catalogues")
+        if declare and element.find("ParameterDeclarations") is not None:
+            scope = Scope(_declarations(element), {}, scope)
+            scope.check()
+        attributes = {name: scope.text(element, name, value) for name, value in element.items()}
+        result = LineElement(element.tag, attributes, getattr(element, "line", 0), getattr(element, "source", ""))
+        result.text = element.text
+        for child in element:
+            if child.tag == "ParameterDeclarations":
+                continue
+            if child.tag == "CatalogReference" and depth < MAX_NESTED:
+                result.append(self.entry(child, scope, depth))
+            else:
+                result.append(self.copy(child, scope, depth=depth))
+        return result
+
+    def entry(self, reference: Element, scope: Scope, depth: int) -> LineElement:
+        """Return the resolved catalogue entry of a reference, or the reference if there is no such catalogue."""
+        copied = self.copy(reference, scope, depth=MAX_NESTED)
+        entry = self.catalogues.entry(copied)
+        if entry is None:
+            return copied
+        assigned = {
+            item.get("parameterRef", ""): item.get("value", "")
+            for item in copied.iterfind("ParameterAssignments/ParameterAssignment")
+        }
+        declarations = _declarations(entry)
+        for name in assigned:
+            if name not in declarations:
+                raise error_at(reference, f"catalogue entry '{copied.get('entryName')}' has no parameter '{name[:60]}'")
+        inner = Scope(declarations, assigned, scope)
+        inner.check()
+        return self.copy(entry, inner, declare=False, depth=depth + 1)
+
+
+class _Catalogues:
+    """Catalogues of the folders that a document names."""
+
+    def __init__(self, root: Element, path: Path, scope: Scope) -> None:
+        stated = [
+            scope.text(directory, "path", directory.get("path", "")).replace("\\", "/")
+            for directory in root.iterfind("CatalogLocations/*/Directory")
+        ]
+        self.folders = [path.parent / folder for folder in stated if not Path(folder).is_absolute()]
+        self._catalogues: dict[str, dict[str, Element]] | None = None
+
+    def entry(self, reference: Element) -> Element | None:
+        """Return the entry that a resolved reference names; None if its catalogue is not there."""
+        if self._catalogues is None:
+            self._catalogues = _read_catalogues(self.folders)
+        catalogue_name, entry_name = reference.get("catalogName", ""), reference.get("entryName", "")
+        catalogue = self._catalogues.get(catalogue_name)
+        if catalogue is None:
+            return None
+        if entry_name not in catalogue:
+            known = ", ".join(sorted(catalogue)[:12])
+            raise error_at(
+                reference, f"catalogue '{catalogue_name[:60]}' has no entry '{entry_name[:60]}'; it has: {known[:300]}"
+            )
+        return catalogue[entry_name]
+
+
+_FOLDERS: dict[tuple[tuple[str, int], ...], dict[str, dict[str, Element]]] = {}
+
+
+def _read_catalogues(folders: Sequence[Path]) -> dict[str, dict[str, Element]]:
+    """Return the entries of the catalogues in folders: name of the catalogue -> name of the entry -> element."""
+    paths: list[Path] = []
+    for folder in dict.fromkeys(folders):
+        paths += sorted(folder.glob("*.xosc")) if folder.is_dir() else [folder] * (folder.suffix == ".xosc")
+    paths = [path for path in dict.fromkeys(paths) if path.is_file()]
+    if len(paths) > MAX_CATALOGUES:
+        raise FormatError(f"{folders[0]}: {len(paths)} files of catalogues; at most {MAX_CATALOGUES} are read")
+    # A distribution resolves one document many times; its catalogues are read once.
+    key = tuple((str(path), path.stat().st_mtime_ns) for path in paths)
+    if key not in _FOLDERS:
+        _FOLDERS.clear()
+        catalogues: dict[str, dict[str, Element]] = {}
+        for path in paths:
+            for catalogue in read_document(path).iterfind("Catalog"):
+                entries = {entry.get("name", ""): entry for entry in catalogue}
+                for name in dict.fromkeys((catalogue.get("name", ""), path.stem)):
+                    catalogues.setdefault(name, {}).update(entries)
+        _FOLDERS[key] = catalogues
+    return _FOLDERS[key]

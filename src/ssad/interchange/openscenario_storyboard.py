@@ -1,0 +1,933 @@
+"""Storyboard of an OpenSCENARIO document as phases, lateral phases, paths and trajectories of its entities.
+
+An event's action becomes a phase whose trigger is that of the event and of its act. Phases begin in any order, as
+events do; one that waits for the one before it stays behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ssad.core.import_report import ImportReport
+from ssad.core.types import Arrival, LateralPhase, Phase, PhaseTrigger, Pose
+from ssad.interchange.openscenario_entities import Entity
+from ssad.interchange.openscenario_places import PositionReader
+from ssad.interchange.openscenario_trajectories import SampledTrajectory
+from ssad.interchange.openscenario_triggers import (
+    ALWAYS,
+    Trigger,
+    TriggerReader,
+    Unfulfilled,
+    all_of,
+    any_of,
+    both,
+    conjuncts,
+    is_lasting,
+)
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, move_pose, place_ahead, place_behind, pose_at
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+LATERAL_TIME: Final = 3.0  # s of a lateral motion whose dynamics the file does not limit
+MAX_PROFILE: Final = 12  # phases of a speed profile
+_KINDS: Final = ("Story", "Act", "ManeuverGroup", "Maneuver", "Event", "Action")
+_SHAPES: Final = ("linear", "sinusoidal", "cubic", "step")
+# Actions that are over as soon as they begin.
+_INSTANT: Final = (
+    "TeleportAction",
+    "ControllerAction",
+    "ActivateControllerAction",
+    "VisibilityAction",
+    "AppearanceAction",
+    "GlobalAction",
+    "UserDefinedAction",
+    "AssignRouteAction",
+)
+# Actions of the ego that the system under test takes the place of.
+_OF_DRIVER: Final = ("LongitudinalAction", "LateralAction", "SynchronizeAction", "RoutingAction", "ControllerAction")
+
+
+@dataclass
+class StoryElement:
+    """Element of the storyboard, and what is made of it.
+
+    Attributes:
+        element: The element.
+        path: Names from the story to it.
+        parent: Element around it.
+        children: Elements in it.
+        phases: Entity and name of each phase that it becomes.
+        duration: Time that it takes, s, if it becomes no phase; None: unknown.
+    """
+
+    element: Element
+    path: tuple[str, ...]
+    parent: StoryElement | None
+    children: list[StoryElement] = field(default_factory=list)
+    phases: list[tuple[str, str]] = field(default_factory=list)
+    duration: float | None = None
+
+    def every(self) -> Iterator[StoryElement]:
+        """Yield the element and all elements in it."""
+        yield self
+        for child in self.children:
+            yield from child.every()
+
+
+@dataclass
+class Motion:
+    """Phases of one action of one entity, without their trigger."""
+
+    entity: Entity
+    phases: list[Phase] = field(default_factory=list)
+    lateral: list[LateralPhase] = field(default_factory=list)
+
+
+class StoryboardReader:
+    """Storyboard of a document; what has no counterpart is counted in `omissions`."""
+
+    def __init__(
+        self,
+        root: Element,
+        places: PositionReader,
+        entities: Mapping[str, Entity],
+        *,
+        parameters: Mapping[str, str],
+        omissions: Counter[str],
+        report: ImportReport,
+    ) -> None:
+        """Create the reader of one document; see `TriggerReader`."""
+        self.root, self.places, self.entities = root, places, entities
+        self.values, self.omissions, self.report = places.values, omissions, report
+        self.triggers = TriggerReader(
+            places,
+            entities,
+            parameters=parameters,
+            omissions=omissions,
+            report=report,
+            element_state=self._element_state,
+        )
+        self.ego = self.triggers.ego
+        self._names: set[str] = set()
+        self._lanes: dict[str, int] = {}  # lanes to the left of the start, after the lateral phases so far
+        self._offsets: dict[str, float] = {}  # m from the centre of that lane
+        self._starts: dict[int, Trigger] = {}
+        self._open: set[int] = set()
+        self.stories = [self._element(story, None) for story in root.iterfind("Storyboard/Story")]
+        self._by_name: dict[str, list[StoryElement]] = {}
+        for story in self.stories:
+            for item in story.every():
+                self._by_name.setdefault(item.path[-1], []).append(item)
+
+    def _element(self, element: Element, parent: StoryElement | None) -> StoryElement:
+        name = self.values.text(element, "name", element.tag)
+        item = StoryElement(element, (*(parent.path if parent else ()), name), parent)
+        deeper = _KINDS[_KINDS.index(element.tag) + 1] if element.tag in _KINDS[:-1] else None
+        if deeper is not None:
+            item.children = [self._element(child, item) for child in element.iterfind(deeper)]
+        return item
+
+    # ------------------------------------------------------------ what happens
+
+    def read(self) -> None:
+        """Give the entities their phases, paths and trajectories."""
+        for private in self.root.iterfind("Storyboard/Init/Actions/Private"):
+            self._initial(private)
+        events = [item for story in self.stories for item in story.every() if item.element.tag == "Event"]
+        planned = []
+        for event in events:
+            actors = self._actors(event)
+            for action in event.children:
+                content = next(iter(action.element), action.element)
+                motions = [self._plan(entity, content, action) for entity in actors]
+                planned.append((event, action, content, motions, actors))
+        for event in events:
+            self._note_repetition(event)
+        for event, action, content, motions, actors in planned:
+            if content.tag == "GlobalAction":
+                self._global(content, event)
+                continue
+            for entity, motion in zip(actors, motions, strict=True):
+                self._happen(entity, motion, content, event, action)
+        for entity in self.entities.values():
+            entity.phases = _in_sequence(entity.phases, entity.name)
+            entity.lateral = _in_sequence(entity.lateral, entity.name)
+
+    def _actors(self, event: StoryElement) -> list[Entity]:
+        group = event.parent.parent if event.parent else None
+        element = None if group is None else group.element.find("Actors")
+        if element is None:
+            return []
+        actors = [self.triggers.referenced_entity(reference) for reference in element.iterfind("EntityRef")]
+        if self.values.truth(element, "selectTriggeringEntities", default=False):
+            actors += [
+                self.triggers.referenced_entity(reference)
+                for reference in event.element.iterfind(".//TriggeringEntities/EntityRef")
+            ]
+        return list({entity.name: entity for entity in actors}.values())
+
+    def _note_repetition(self, event: StoryElement) -> None:
+        group = event.parent.parent if event.parent else None
+        has_phases = any(part.phases for part in event.every())
+        for item in (event, *([group] if group else [])):
+            count = self.values.number(item.element, "maximumExecutionCount", 1.0)
+            if count > 1 and has_phases:
+                self.omissions[f"'{item.path[-1]}' takes place once, not up to {count:g} times"] += 1
+        if self.values.text(event.element, "priority", "override") == "skip" and has_phases:
+            self.omissions[f"priority 'skip' of '{event.path[-1]}': it takes place beside other events"] += 1
+
+    def _initial(self, private: Element) -> None:
+        """Carry out the actions of an entity at the start."""
+        entity = self.triggers.referenced_entity(private)
+        for action in private:
+            content = next(iter(action), action)
+            if content.tag == "ControllerAction":
+                self._driver(entity, content)
+                continue
+            if content.tag == "TeleportAction":
+                continue
+            speed_action = content.find("SpeedAction")
+            if speed_action is not None:
+                phase = self._speed_phase(entity, speed_action)
+                if phase is None:
+                    continue
+                if phase.shape == "step" and not phase.continuous:
+                    entity.speed = self._start_speed(entity, phase)
+                    continue
+            item = StoryElement(action, ("start",), None)
+            motion = self._plan(entity, action, item)
+            self._carry_out(motion, action, item, trigger=ALWAYS, label=f"the start of '{entity.name}'")
+
+    def _start_speed(self, entity: Entity, phase: Phase) -> float:
+        """Return the speed at the start that a phase states, also relative to that of another entity."""
+        speed = phase.speed or 0.0
+        if not phase.reference:
+            return speed
+        other = self.ego if phase.reference == "ego" else self.entities[phase.reference]
+        absolute = other.speed * speed if phase.factor else other.speed + speed
+        return self._limited_speed(entity, absolute)
+
+    def _driver(self, entity: Entity, action: Element) -> None:
+        for controller in action.iter("Controller"):
+            properties = {item.get("name", ""): item for item in controller.iter("Property")}
+            if "target_speed" in properties:
+                entity.target_speed = self.values.number(properties["target_speed"], "value")
+            name = self.values.text(controller, "name", "")
+            if not entity.ego:
+                if name in ("autopilot", "blind") and "target_speed" in properties:
+                    entity.policy = name
+                else:
+                    self.omissions[f"controller '{name}' of '{entity.name}'"] += 1
+        if action.find(".//CatalogReference") is not None and not entity.ego:
+            self.omissions[f"controller of '{entity.name}' in a catalogue"] += 1
+
+    def record_omission(self, context: str, action: Element) -> None:
+        """Name an action that has no counterpart: the innermost element whose name says what it does."""
+        action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
+        self.omissions[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
+
+    def _global(self, action: Element, event: StoryElement) -> None:
+        entity_action = action.find("EntityAction")
+        label = event.path[-1]
+        if entity_action is None:
+            self.record_omission(f"in event '{label}'", action)
+            return
+        entity = self.triggers.referenced_entity(entity_action)
+        time = self._time(self._begin(event, entity))
+        is_arrival = entity_action.find("AddEntityAction") is not None
+        if time is None or math.isinf(time):
+            if time is None:
+                stays = "it is there from the start" if is_arrival else "it stays"
+                self.omissions[f"{'Add' if is_arrival else 'Delete'}EntityAction of '{entity.name}': {stays}"] += 1
+        elif is_arrival:
+            entity.appears = time
+        else:
+            entity.leaves = min(entity.leaves, time)
+
+    def _time(self, trigger: Trigger) -> float | None:
+        """Return the time at which a trigger holds; inf: never; None: it depends on what happens."""
+        if trigger is Unfulfilled.NEVER:
+            return math.inf
+        if not isinstance(trigger, PhaseTrigger) or trigger.any or trigger.edge != "none":
+            return None
+        own = {"always": 0.0, "time": trigger.value + trigger.delay}.get(trigger.kind)
+        times = [own, *(self._time(part) for part in trigger.all)]
+        known = [time for time in times if time is not None]
+        return max(known) if len(known) == len(times) and trigger.rule != "below" else None
+
+    # ------------------------------------------------------------ triggers of elements
+
+    def _begin(self, event: StoryElement, entity: Entity) -> Trigger:
+        """Return the trigger of an event that is carried out; it must not wait for itself."""
+        self._open.add(id(event))
+        try:
+            return self.start(event, entity)
+        finally:
+            self._open.discard(id(event))
+
+    def start(self, event: StoryElement, entity: Entity | None) -> Trigger:
+        """Return the trigger of an event: its own and that of its act."""
+        label = event.path[-1]
+        own = self.triggers.trigger(event.element.find("StartTrigger"), entity, label)
+        act = self._around(event, "Act")
+        if act is None:
+            return own
+        around = self.triggers.trigger(act.element.find("StartTrigger"), entity, act.path[-1])
+        if ALWAYS in (own, around) or not isinstance(own, PhaseTrigger):
+            return both(own, around)
+        if isinstance(around, PhaseTrigger) and not is_lasting(around):
+            self.omissions[
+                f"that act '{act.path[-1]}' goes on after its trigger: '{label}' needs it still to hold"
+            ] += 1
+        return both(around, own)
+
+    def _around(self, item: StoryElement, tag: str) -> StoryElement | None:
+        while item.element.tag != tag:
+            if item.parent is None:
+                return None
+            item = item.parent
+        return item
+
+    def _element_state(self, content: Element, label: str) -> Trigger:
+        """Return the trigger that a StoryboardElementStateCondition means."""
+        name = self.values.text(content, "storyboardElementRef")
+        kind = self.values.text(content, "storyboardElementType", "")
+        state = self.values.text(content, "state")
+        parts = tuple(part.strip() for part in name.split("::"))
+        candidates = [
+            item
+            for item in self._by_name.get(parts[-1], [])
+            if item.path[-len(parts) :] == parts and kind.lower() in ("", item.element.tag.lower())
+        ]
+        if not candidates:
+            return self.triggers.never(content, label, f"there is no {kind or 'element'} '{name[:60]}'")
+        item = candidates[0]
+        events = [part for part in item.every() if part.element.tag == "Event"]
+        if item.element.tag == "Action" and item.parent is not None:
+            events = [item.parent]
+        begins = [self._takes_place(event, content, label) for event in events]
+        if begins and not any(isinstance(trigger, PhaseTrigger) for trigger in begins):
+            return begins[0]
+        if state in ("startTransition", "runningState"):
+            return self._begun(item, content, label)
+        if state in ("endTransition", "completeState", "stopTransition", "skipTransition"):
+            return self._ended(item, content, label)
+        return ALWAYS if state == "standbyState" else Unfulfilled.UNKNOWN
+
+    def _begun(self, item: StoryElement, content: Element, label: str) -> Trigger:
+        phases = [phase for part in item.every() for phase in part.phases]
+        if phases and item.element.tag in ("Event", "Action"):
+            return PhaseTrigger("phase_start", agent=phases[0][0], phase=phases[0][1])
+        if item.element.tag in ("Story", "Act"):
+            act = item if item.element.tag == "Act" else next(iter(item.children), None)
+            if act is None:
+                return ALWAYS
+            return self._guarded(act, content, label, partial(self._act_start, act))
+        events = [part for part in item.every() if part.element.tag == "Event"]
+        if item.element.tag == "Action" and item.parent is not None:
+            events = [item.parent]
+        return any_of([self._guarded(event, content, label, partial(self._event_start, event)) for event in events])
+
+    def _takes_place(self, event: StoryElement, content: Element, label: str) -> Trigger:
+        """Return the start of an event, for whether it has one; nothing is counted as an omission."""
+        counted = dict(self.omissions)
+        try:
+            return self._guarded(event, content, label, partial(self.start, event, None))
+        finally:
+            self.omissions.clear()
+            self.omissions.update(counted)
+
+    def _act_start(self, act: StoryElement) -> Trigger:
+        return self.triggers.trigger(act.element.find("StartTrigger"), None, act.path[-1])
+
+    def _event_start(self, event: StoryElement) -> Trigger:
+        trigger = self.start(event, None)
+        if isinstance(trigger, PhaseTrigger) and not is_lasting(trigger):
+            self.omissions[f"that event '{event.path[-1]}' has begun is taken as its trigger"] += 1
+        return trigger
+
+    def _guarded(self, item: StoryElement, content: Element, label: str, make: Callable[[], Trigger]) -> Trigger:
+        """Return the start of an element; events that wait for each other never begin."""
+        key = id(item)
+        if key in self._starts:
+            return self._starts[key]
+        if key in self._open:
+            return self.triggers.never(content, label, "events wait for each other")
+        self._open.add(key)
+        try:
+            result = make()
+        finally:
+            self._open.discard(key)
+        self._starts[key] = result
+        return result
+
+    def _ended(self, item: StoryElement, content: Element, label: str) -> Trigger:
+        if not item.phases and item.element.tag == "Action":
+            return self._after_start(item, content, label)
+        if item.element.tag == "Action":
+            # The last phase of an action ends it, for each of its entities.
+            last = dict(item.phases)
+            return all_of([PhaseTrigger("phase_end", agent=name, phase=phase) for name, phase in last.items()])
+        if any(id(child) in self._open for child in item.every()):
+            return self.triggers.never(content, label, "events wait for each other")
+        children = [
+            child
+            for child in item.children
+            if child.element.tag != "Event" or isinstance(self._takes_place(child, content, label), PhaseTrigger)
+        ]
+        parts = [self._ended(child, content, label) for child in children]
+        return all_of(parts) if parts else self._begun(item, content, label)
+
+    def _after_start(self, action: StoryElement, content: Element, label: str) -> Trigger:
+        """Return the end of an action that becomes no phase: its start, so much later as it takes."""
+        event = action.parent
+        if event is None:
+            return Unfulfilled.UNKNOWN
+        trigger = self._begun(event, content, label)
+        if not isinstance(trigger, PhaseTrigger):
+            return trigger
+        tags = {element.tag for element in action.element.iter()}
+        if action.duration is None and not tags & set(_INSTANT):
+            self.omissions[f"the end of '{action.path[-1]}', which '{label}' waits for, is taken as its start"] += 1
+        if not action.duration:
+            return trigger
+        if trigger == ALWAYS:
+            return PhaseTrigger("time", action.duration)
+        if trigger.kind == "time" and trigger.edge == "none" and not trigger.all:
+            return replace(trigger, value=trigger.value + action.duration)
+        return replace(trigger, delay=trigger.delay + action.duration)
+
+    # ------------------------------------------------------------ actions as phases
+
+    def _name(self, action: StoryElement, entity: Entity) -> str:
+        """Return a name for the phase of an action that no other phase has."""
+        event = action.parent.path[-1] if action.parent else f"{action.path[-1]} of {entity.name}"
+        names = [event, f"{event} {action.path[-1]}"]
+        names += [f"{event} {action.path[-1]} {number}" for number in range(2, 1000)]
+        name = next((name for name in names if name not in self._names), names[-1])
+        self._names.add(name)
+        return name
+
+    def _plan(self, entity: Entity, content: Element, action: StoryElement) -> Motion:
+        """Return the phases of an action, without their trigger, and note which they are."""
+        motion = Motion(entity)
+        if entity.ego:
+            return motion
+        inner = next(iter(content), content)
+        if content.tag == "SynchronizeAction" or inner.tag == "SynchronizeAction":
+            motion.phases = self._arrival(entity, content if content.tag == "SynchronizeAction" else inner)
+        elif (speed_action := content.find(".//SpeedAction")) is not None:
+            speed_phase = self._speed_phase(entity, speed_action)
+            motion.phases = [speed_phase] if speed_phase else []
+        elif (profile := content.find(".//SpeedProfileAction")) is not None:
+            motion.phases = self._profile(entity, profile)
+        elif (change := content.find(".//LaneChangeAction")) is not None:
+            lateral = self._lane_change(entity, change)
+            motion.lateral = [lateral] if lateral else []
+        elif (offset := content.find(".//LaneOffsetAction")) is not None:
+            motion.lateral = [self._lane_offset(entity, offset)]
+        previous = ""
+        for index, planned in enumerate(motion.phases):
+            name = self._name(action, entity)
+            when = PhaseTrigger("phase_end", agent=entity.name, phase=previous) if previous else ALWAYS
+            motion.phases[index] = replace(planned, name=name, when=when)
+            action.phases.append((entity.name, name))
+            previous = name
+        for index, lateral_phase in enumerate(motion.lateral):
+            motion.lateral[index] = replace(lateral_phase, name=self._name(action, entity))
+            action.phases.append((entity.name, motion.lateral[index].name))
+        return motion
+
+    def _happen(
+        self, entity: Entity, motion: Motion, content: Element, event: StoryElement, action: StoryElement
+    ) -> None:
+        """Give an entity the phases of an action with the trigger of its event."""
+        label = event.path[-1]
+        if entity.ego:
+            tags = {element.tag for element in (content, *content)}
+            routing = content if content.tag == "RoutingAction" else content.find("RoutingAction")
+            trigger = self._begin(event, entity)
+            if routing is not None and isinstance(trigger, PhaseTrigger) and not (entity.route or entity.path):
+                self._routing(entity, routing, action, trigger, f"event '{label}'")
+            elif tags & set(_OF_DRIVER) - {"ControllerAction"}:
+                self.omissions[f"event '{label}' of the ego: the system under test drives it"] += 1
+            elif "ControllerAction" not in tags:
+                self.record_omission(f"in event '{label}'", content)
+            return
+        trigger = self._begin(event, entity)
+        if trigger is Unfulfilled.NEVER:
+            return
+        if trigger is Unfulfilled.UNKNOWN:
+            self.omissions[f"event '{label}': when it begins is not known"] += 1
+            return
+        self._carry_out(motion, content, action, trigger=trigger, label=f"event '{label}'")
+
+    def _carry_out(
+        self, motion: Motion, content: Element, action: StoryElement, *, trigger: PhaseTrigger, label: str
+    ) -> None:
+        """Give an entity the phases of an action, or its path."""
+        entity = motion.entity
+        inner = next(iter(content), content)
+        routing = content if content.tag == "RoutingAction" else inner if inner.tag == "RoutingAction" else None
+        if motion.phases or motion.lateral:
+            entity.phases += _with_trigger(motion.phases, trigger)
+            entity.lateral += _with_trigger(motion.lateral, trigger)
+        elif routing is not None:
+            self._routing(entity, routing, action, trigger, label)
+        elif (keep := content.find(".//LongitudinalDistanceAction")) is not None:
+            self._keep_distance(entity, keep, trigger, label)
+        elif content.find(".//SpeedAction") is None and content.find(".//LaneChangeAction") is None:
+            if entity.ego and inner.tag in _OF_DRIVER:
+                self.omissions[f"{inner.tag} at {label}: the system under test drives the ego"] += 1
+            else:
+                self.record_omission(f"at {label}" if label.startswith("the start") else f"in {label}", content)
+
+    def _limited_speed(self, entity: Entity, speed: float) -> float:
+        """Return a speed that the entity can have; a file without limits of its own sets them by its speeds."""
+        limit = entity.max_speed
+        if speed > limit > 0.0 and entity.element.find("*/Performance") is None and speed <= 100.0:
+            entity.body = replace(entity.body, max_speed=speed)
+            limit = speed
+        if not 0.0 <= speed <= limit and not entity.ego:
+            self.omissions[f"a speed of '{entity.name}' of {speed:g} m/s: it has 0 to {limit:g} m/s"] += 1
+        return min(max(speed, 0.0), limit) if not entity.ego else max(speed, 0.0)
+
+    def _speed_phase(self, entity: Entity, action: Element) -> Phase | None:
+        """Return the phase of a SpeedAction; None if its rate of 0 leaves the speed as it is."""
+        target = action.find("SpeedActionTarget/AbsoluteTargetSpeed")
+        relative = action.find("SpeedActionTarget/RelativeTargetSpeed")
+        if target is not None:
+            phase = Phase(self._limited_speed(entity, self.values.number(target, "value")))
+        elif relative is not None:
+            other = self.triggers.referenced_entity(relative)
+            is_factor = self.values.text(relative, "speedTargetValueType", "delta") == "factor"
+            phase = Phase(
+                self.values.number(relative, "value"),
+                reference=self.triggers.agent_name(other),
+                factor=is_factor,
+                continuous=self.values.truth(relative, "continuous", default=False),
+            )
+        else:
+            raise self.values.error(action, "SpeedActionTarget is missing")
+        return self._with_dynamics(entity, phase, action.find("SpeedActionDynamics"))
+
+    def _with_dynamics(self, entity: Entity, phase: Phase, dynamics: Element | None) -> Phase | None:
+        """Return a phase with the dynamics of a transition; None if a rate of 0 never ends it."""
+        if dynamics is None:
+            return phase if phase.continuous else replace(phase, shape="step")
+        shape, dimension, value = self._dynamics(dynamics)
+        if dimension == "rate" and value == 0.0 and shape != "step":
+            return None
+        is_full = dimension == "rate" and shape == "linear" and value in entity.limits
+        if phase.continuous or is_full:
+            # Full power and full brakes are what a phase without an acceleration has.
+            return phase if is_full or dimension != "rate" or shape == "step" else replace(phase, acceleration=value)
+        if shape == "step" or value == 0.0:
+            return replace(phase, shape="step")
+        keyword = {"rate": "acceleration", "time": "duration", "distance": "distance"}[dimension]
+        return replace(phase, shape=shape, **{keyword: value})  # type: ignore[arg-type]
+
+    def _dynamics(self, element: Element) -> tuple[str, str, float]:
+        """Return shape, dimension and value of the dynamics of a transition."""
+        shape = self.values.text(element, "dynamicsShape")
+        dimension = self.values.text(element, "dynamicsDimension", "time")
+        if shape not in _SHAPES:
+            raise self.values.error(element, f"dynamicsShape is '{shape[:40]}'; known: {', '.join(_SHAPES)}")
+        if dimension not in ("rate", "time", "distance"):
+            raise self.values.error(element, f"dynamicsDimension is '{dimension[:40]}'; known: rate, time, distance")
+        return shape, dimension, abs(self.values.number(element, "value", 0.0))
+
+    def _profile(self, entity: Entity, action: Element) -> list[Phase]:
+        """Return the phases of a SpeedProfileAction: one to each entry."""
+        entries = action.findall("SpeedProfileEntry")
+        if not entries:
+            raise self.values.error(action, "SpeedProfileEntry is missing")
+        reference = ""
+        if action.get("entityRef"):
+            reference = self.triggers.agent_name(self.triggers.referenced_entity(action))
+        limits = action.find("DynamicConstraints")
+        phases = []
+        speed_before = entity.speed
+        for index, entry in enumerate(entries):
+            speed = self.values.number(entry, "speed")
+            if not reference:
+                speed = self._limited_speed(entity, speed)
+            time = self.values.number(entry, "time", 0.0)
+            if index == 0 and time == 0.0 and len(entries) > 1:
+                speed_before = speed
+                continue  # the speed at which the profile begins
+            phase = Phase(speed, reference=reference)
+            if time > 0.0:
+                phase = replace(phase, duration=time)
+            elif limits is not None:
+                way = "Acceleration" if speed >= speed_before else "Deceleration"
+                rate = self.values.number(limits, f"max{way}", 0.0)
+                jerk = self.values.number(limits, f"max{way}Rate", 0.0)
+                phase = replace(phase, acceleration=rate or None, jerk=jerk or None)
+            phases.append(phase)
+            speed_before = speed
+        return phases
+
+    def _arrival(self, entity: Entity, action: Element) -> list[Phase]:
+        """Return the phase of a SynchronizeAction."""
+        name = "masterEntityRef" if action.get("masterEntityRef") else "entityRef"
+        master_name = self.values.text(action, name)
+        if master_name not in self.entities:
+            raise self.values.error(action, f"there is no entity '{master_name}'")
+        master = self.entities[master_name]
+        poses = []
+        for tag, body in (("TargetPosition", entity), ("TargetPositionMaster", master)):
+            position = action.find(tag)
+            if not self.places.is_supported(position):
+                self.omissions[f"SynchronizeAction of '{entity.name}': a position that is not read"] += 1
+                return []
+            poses.append(self._centre(body, self.places.pose(position, within=action)))
+        absolute = action.find("FinalSpeed/AbsoluteSpeed")
+        speed: float | None = None
+        if absolute is not None:
+            speed = self._limited_speed(entity, self.values.number(absolute, "value"))
+            poses = self._before_steady_state(action, poses, speed=speed, master=master)
+        elif action.find("FinalSpeed/RelativeSpeedToMaster") is not None:
+            self.omissions[f"the final speed of '{entity.name}', which depends on that of '{master.name}'"] += 1
+        own, other = ((pose.x, pose.y) for pose in poses)
+        return [Phase(speed, arrival=Arrival(own, other, self.triggers.agent_name(master)))]
+
+    def _before_steady_state(self, action: Element, poses: list[Pose], *, speed: float, master: Entity) -> list[Pose]:
+        """Return the places of a meeting, or those at which the steady state before it begins.
+
+        From there on the entity keeps its final speed; the other one is taken to keep its speed at the start.
+        """
+        by_distance = action.find("FinalSpeed/AbsoluteSpeed/TargetDistanceSteadyState")
+        by_time = action.find("FinalSpeed/AbsoluteSpeed/TargetTimeSteadyState")
+        if by_distance is not None:
+            distance = self.values.number(by_distance, "distance")
+        elif by_time is not None:
+            distance = self.values.number(by_time, "time") * speed
+        else:
+            return poses
+        if speed <= 0.0 or distance <= 0.0:
+            return poses
+        own, other = poses
+        back = master.speed * distance / speed
+        start = self._centre(master, self.places.start(master.name, within=action))
+        if back <= 0.0 or back >= math.dist((start.x, start.y), (other.x, other.y)):
+            self.omissions[f"the steady state before the meeting with '{master.name}'"] += 1
+            return poses
+        return [
+            self._earlier(action.find("TargetPosition"), own, distance),
+            self._earlier(action.find("TargetPositionMaster"), other, back),
+        ]
+
+    def _earlier(self, position: Element | None, pose: Pose, distance: float) -> Pose:
+        """Return the pose that lies a distance before one: on the trajectory or route of its position, or its lane."""
+        content = None if position is None else next(iter(position), None)
+        trajectory = None if content is None else content.find("TrajectoryRef/Trajectory")
+        route = None if content is None else content.find("RouteRef/Route")
+        if trajectory is not None or route is not None:
+            way = self.places.route(route) if trajectory is None and route is not None else None
+            way = way or self.places.trajectory(trajectory)  # type: ignore[arg-type]
+            return way.before(pose, distance)
+        place = self.places.lane_under(pose)
+        if place is None:
+            return move_pose(pose, -distance, 0.0)
+        graph = self.places.graph
+        centre = pose_at(graph, place)
+        aside = -math.sin(centre.yaw) * (pose.x - centre.x) + math.cos(centre.yaw) * (pose.y - centre.y)
+        return move_pose(pose_at(graph, place_behind(graph, place, distance)), 0.0, aside)
+
+    # ------------------------------------------------------------ lateral actions
+
+    def _lane_change(self, entity: Entity, action: Element) -> LateralPhase | None:
+        relative = action.find("LaneChangeTarget/RelativeTargetLane")
+        absolute = action.find("LaneChangeTarget/AbsoluteTargetLane")
+        before = self._lanes.get(entity.name, 0)
+        if relative is not None:
+            other = self.triggers.referenced_entity(relative)
+            lanes = self.values.lanes(relative, "value")
+            total = before + lanes if other is entity else self._lanes_to(entity, other, lanes)
+        elif absolute is not None:
+            total = self._lanes_to_id(entity, int(self.values.number(absolute, "value")))
+        else:
+            raise self.values.error(action, "LaneChangeTarget is missing")
+        if total is None:
+            self.omissions[f"LaneChangeAction of '{entity.name}': its target lane is not beside its own"] += 1
+            return None
+        self._lanes[entity.name] = total
+        phase = LateralPhase(total - before, offset=self.values.number(action, "targetLaneOffset", 0.0))
+        self._offsets[entity.name] = phase.offset
+        dynamics = action.find("LaneChangeActionDynamics")
+        if dynamics is None:
+            raise self.values.error(action, "LaneChangeActionDynamics is missing")
+        shape, dimension, value = self._dynamics(dynamics)
+        if shape == "step" or value == 0.0:
+            return replace(phase, shape="step")
+        keyword = {"rate": "rate", "time": "duration", "distance": "distance"}[dimension]
+        return replace(phase, shape=shape, **{keyword: value})  # type: ignore[arg-type]
+
+    def _lane(self, entity: Entity) -> LanePosition | None:
+        if not entity.placed:
+            return None
+        pose = self._centre(entity, self.places.start(entity.name, within=entity.element))
+        return self.places.lane_under(pose) or self.places.lane_under(pose, aligned=False)
+
+    def _lanes_to(self, entity: Entity, other: Entity, lanes: int) -> int | None:
+        """Return the number of lanes from the start lane of an entity to that `lanes` left of another's lane."""
+        own, reference = self._lane(entity), self._lane(other)
+        if own is None or reference is None:
+            return None
+        return self._number(reference) + self._lanes.get(other.name, 0) + lanes - self._number(own)
+
+    def _number(self, place: LanePosition) -> int:
+        """Return the number of lanes of the same direction on the right of a lane."""
+        graph, lane, count = self.places.graph, place.lane, 0
+        while (beside := int(graph.right[lane])) >= 0 and count < 20:
+            if graph.kind[beside] != graph.kind[lane] or not graph.is_same_direction(lane, beside):
+                break
+            lane, count = beside, count + 1
+        return count
+
+    def _lanes_to_id(self, entity: Entity, lane_id: int) -> int | None:
+        """Return the number of lanes from the start lane of an entity to that with an id."""
+        place = self._lane(entity)
+        if place is None:
+            return None
+        graph = self.places.graph
+        for side, step in ((graph.left, 1), (graph.right, -1)):
+            lane, count, neighbours = place.lane, 0, side
+            while lane >= 0 and abs(count) <= 20:
+                if int(graph.lane_id[lane]) == lane_id:
+                    return count
+                beside = int(neighbours[lane])
+                if beside >= 0 and not graph.is_same_direction(lane, beside):
+                    # Further left of the oncoming lanes is on their right.
+                    neighbours = graph.right if neighbours is graph.left else graph.left
+                lane, count = beside, count + step
+        return None
+
+    def _lane_offset(self, entity: Entity, action: Element) -> LateralPhase:
+        absolute = action.find("LaneOffsetTarget/AbsoluteTargetLaneOffset")
+        relative = action.find("LaneOffsetTarget/RelativeTargetLaneOffset")
+        target = absolute if absolute is not None else relative
+        if target is None:
+            raise self.values.error(action, "LaneOffsetTarget is missing")
+        value = self.values.number(target, "value")
+        if relative is not None and absolute is None and self.triggers.referenced_entity(relative) is not entity:
+            self.omissions[
+                f"the lane offset of '{entity.name}' relative to another is taken from the lane's centre"
+            ] += 1
+        phase = LateralPhase(0, offset=value)
+        before, self._offsets[entity.name] = self._offsets.get(entity.name, 0.0), value
+        dynamics = action.find("LaneOffsetActionDynamics")
+        shape = "sinusoidal" if dynamics is None else self.values.text(dynamics, "dynamicsShape", "sinusoidal")
+        if shape not in _SHAPES:
+            raise self.values.error(action, f"dynamicsShape is '{shape[:40]}'; known: {', '.join(_SHAPES)}")
+        if shape == "step":
+            return replace(phase, shape="step")
+        limit = 0.0 if dynamics is None else self.values.number(dynamics, "maxLateralAcc", 0.0)
+        if limit <= 0.0:
+            return replace(phase, shape=shape, duration=LATERAL_TIME)  # type: ignore[arg-type]
+        # Half a cosine over d metres in T seconds has an acceleration of at most pi^2 d / (2 T^2).
+        moved = max(abs(value - before), 0.1)
+        return replace(phase, shape=shape, duration=math.pi * math.sqrt(0.5 * moved / limit))  # type: ignore[arg-type]
+
+    # ------------------------------------------------------------ distances
+
+    def _keep_distance(self, entity: Entity, action: Element, trigger: PhaseTrigger, label: str) -> None:
+        """Place an entity at its distance at the start; later, follow the speed of the other entity."""
+        other = self.triggers.referenced_entity(action)
+        if entity.ego:
+            self.omissions[f"LongitudinalDistanceAction at {label}: the system under test drives the ego"] += 1
+            return
+        continuous = self.values.truth(action, "continuous", default=False)
+        dynamic = action.find("DynamicConstraints") is not None
+        if trigger == ALWAYS and not dynamic and entity.placed and other.placed:
+            self._place_at_distance(entity, other, action)
+            if not continuous:
+                return
+        if not continuous and not dynamic:
+            self.omissions[f"LongitudinalDistanceAction in {label}: '{entity.name}' does not jump"] += 1
+            return
+        self.omissions[f"the distance of '{entity.name}' to '{other.name}': it follows its speed only"] += 1
+        name = self._name(StoryElement(action, (label,), None), entity)
+        reference = self.triggers.agent_name(other)
+        entity.phases.append(Phase(0.0, trigger, name=name, reference=reference, continuous=continuous, anytime=True))
+
+    def _place_at_distance(self, entity: Entity, other: Entity, action: Element) -> None:
+        """Place an entity along the lane of another, at a distance to it."""
+        own = self._centre(entity, self.places.start(entity.name, within=action))
+        reference = self._centre(other, self.places.start(other.name, within=action))
+        distance = self.values.number(action, "distance", math.nan if action.get("timeGap") is None else 0.0)
+        if action.get("timeGap") is not None:
+            distance = self.values.number(action, "timeGap") * entity.speed
+        displacement = self.values.text(action, "displacement", "any")
+        ahead = math.cos(reference.yaw) * (own.x - reference.x) + math.sin(reference.yaw) * (own.y - reference.y)
+        side = {"leadingReferencedEntity": 1.0, "trailingReferencedEntity": -1.0}.get(
+            displacement, math.copysign(1, ahead)
+        )
+        if self.values.truth(action, "freespace", default=False):
+            distance += 0.5 * (entity.length + other.length)
+        else:
+            distance += side * (entity.centre[0] - other.centre[0])
+        shift = side * distance - ahead
+        place = self.places.lane_under(own)
+        if place is None:
+            moved = move_pose(own, shift, 0.0)
+        else:
+            graph = self.places.graph
+            centre = pose_at(graph, place)
+            aside = -math.sin(centre.yaw) * (own.x - centre.x) + math.cos(centre.yaw) * (own.y - centre.y)
+            there = place_ahead(graph, place, shift) if shift >= 0.0 else place_behind(graph, place, -shift)
+            moved = move_pose(pose_at(graph, there), 0.0, aside)
+        self.places.moved[entity.name] = move_pose(moved, -entity.centre[0], -entity.centre[1])
+
+    # ------------------------------------------------------------ routes and trajectories
+
+    def _centre(self, entity: Entity, pose: Pose) -> Pose:
+        return move_pose(pose, *entity.centre) if any(entity.centre) else pose
+
+    def _routing(
+        self, entity: Entity, routing: Element, action: StoryElement, trigger: PhaseTrigger, label: str
+    ) -> None:
+        inner = next(iter(routing), routing)
+        if inner.tag == "AcquirePositionAction":
+            position = inner.find("Position")
+            if self.places.is_supported(position):
+                entity.route = (self.places.pose(position, within=inner),)
+                self._note_late(trigger, label, "heads for that position from the start", entity)
+                return
+        elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
+            route = inner.find("Route")
+            assert route is not None
+            if all(self.places.is_supported(item.find("Position")) for item in route.iterfind("Waypoint")):
+                entity.route = self.places.waypoints(route)
+                self._note_late(trigger, label, "has that route from the start", entity)
+                return
+        elif inner.tag == "FollowTrajectoryAction":
+            self._trajectory(entity, inner, action, trigger, label)
+            return
+        self.record_omission(f"of '{entity.name}'", routing)
+
+    def _note_late(self, trigger: PhaseTrigger, label: str, does: str, entity: Entity) -> None:
+        if trigger != ALWAYS and not is_lasting(trigger):
+            self.omissions[f"the trigger of {label}: '{entity.name}' {does}"] += 1
+
+    def _trajectory(
+        self, entity: Entity, follow: Element, action: StoryElement, trigger: PhaseTrigger, label: str
+    ) -> None:
+        way = self.find_trajectory(follow, entity)
+        if way is None:
+            self.omissions[f"a trajectory of '{entity.name}' that is not read"] += 1
+            return
+        poses = [self._centre(entity, Pose(*row)) for row in np.column_stack([way.xy, way.yaw]).tolist()]
+        if entity.ego:
+            entity.path = tuple(poses)
+            return
+        timing = follow.find("TimeReference/Timing")
+        if timing is None or way.times is None:
+            if timing is not None:
+                self.omissions[f"the times of the trajectory of '{entity.name}': its points have none"] += 1
+            entity.path = tuple(poses)
+            self._note_late(trigger, label, "keeps that path from the start", entity)
+            return
+        scale, offset = (
+            self.values.number(timing, name, default) for name, default in (("scale", 1.0), ("offset", 0.0))
+        )
+        times = (way.times * scale + offset).tolist()
+        is_relative = self.values.text(timing, "domainAbsoluteRelative") == "relative"
+        begins = self._time(trigger)
+        if begins is not None and scale > 0.0:
+            start = begins if is_relative else 0.0
+            action.duration = times[-1] - (0.0 if is_relative else begins)
+            entity.rows = tuple(
+                (time + start, pose.x, pose.y, pose.yaw) for time, pose in zip(times, poses, strict=True)
+            )
+            return
+        self._timed_path(entity, poses, times, action=action, trigger=trigger)
+
+    def _timed_path(
+        self,
+        entity: Entity,
+        poses: Sequence[Pose],
+        times: Sequence[float],
+        *,
+        action: StoryElement,
+        trigger: PhaseTrigger,
+    ) -> None:
+        """Make a trajectory that begins at an event a path, and its times speeds."""
+        action.duration = times[-1] - times[0]
+        entity.path = tuple(poses)
+        steps = np.hypot(*np.diff([(pose.x, pose.y) for pose in poses], axis=0).T)
+        speeds = steps / np.maximum(np.diff(times), 1e-3)
+        edges = np.unique(np.linspace(0, len(speeds), min(len(speeds), MAX_PROFILE) + 1).astype(int))
+        if len(edges) - 1 < len(speeds):
+            self.omissions[f"the speeds of the trajectory of '{entity.name}' are means of its parts"] += 1
+        previous, previous_first = "", 0
+        for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            speed = self._limited_speed(entity, float(steps[first:last].sum() / max(times[last] - times[first], 1e-3)))
+            when = trigger
+            if previous:
+                begun = PhaseTrigger("phase_start", agent=entity.name, phase=previous)
+                when = replace(begun, delay=times[first] - times[previous_first])
+            previous, previous_first = self._name(action, entity), first
+            entity.phases.append(Phase(speed, when, name=previous, shape="step", anytime=True))
+            action.phases.append((entity.name, previous))
+
+    def find_trajectory(self, follow: Element, entity: Entity) -> SampledTrajectory | None:
+        """Return the trajectory of an action, from where it begins; None if it is not read."""
+        element = next((item for item in follow.iter("Trajectory")), None)
+        if element is None or not all(self.places.is_supported(item) for item in element.iter("Position")):
+            return None
+        way = self.places.trajectory(element, entity.name if entity.placed else "")
+        skipped = self.values.number(follow, "initialDistanceOffset", 0.0)
+        if skipped <= 0.0 or skipped >= float(way.s[-1]):
+            return way
+        rest = int(np.searchsorted(way.s, skipped, side="right"))
+        start = way.at(skipped)
+        times = None
+        if way.times is not None:
+            times = np.concatenate([[float(np.interp(skipped, way.s, way.times))], way.times[rest:]])
+        return SampledTrajectory(
+            np.concatenate([[(start.x, start.y)], way.xy[rest:]]),
+            np.concatenate([[start.yaw], way.yaw[rest:]]),
+            np.concatenate([[0.0], way.s[rest:] - skipped]),
+            times,
+        )
+
+
+def _with_trigger(phases: Sequence, trigger: PhaseTrigger) -> list:  # type: ignore[type-arg]
+    """Return phases of which the first waits for a trigger, and each other one for the one before it."""
+    return [replace(phase, when=trigger if phase.when == ALWAYS else phase.when, anytime=True) for phase in phases]
+
+
+def _in_sequence(phases: Sequence, entity: str) -> list:  # type: ignore[type-arg]
+    """Return phases without conditions that their order gives: one waits for the one before it."""
+    result: list = []  # type: ignore[type-arg]
+    for index, phase in enumerate(phases):
+        parts = conjuncts(phase.when)
+        # A phase behind one that may begin at any time waits for those before that, too.
+        required = list[str]()
+        for other in reversed(result):
+            required.append(other.name)
+            if not other.anytime:
+                break
+        begun = {name: PhaseTrigger("phase_start", agent=entity, phase=name) for name in required}
+        late = [part for part in parts if required and replace(part, delay=0.0) == begun[required[0]] and part.delay]
+        ended = {part.phase for part in parts if part.kind == "phase_end" and part.agent == entity}
+        if index == 0:
+            result.append(replace(phase, anytime=False))
+        elif late and len(parts) == len(required) == 1:
+            result.append(replace(phase, when=PhaseTrigger("after", late[0].delay), anytime=False))
+        elif all(begun[name] in parts or name in ended for name in required):
+            rest = [part for part in parts if part not in begun.values()]
+            result.append(replace(phase, when=all_of(rest) if rest else ALWAYS, anytime=False))
+        else:
+            result.append(phase)
+    return result

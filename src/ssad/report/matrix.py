@@ -1,0 +1,251 @@
+"""Matrix tables of a sweep: a metric over two swept parameters, a table for each system and value of the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final, TypeGuard
+
+from ssad.metrics import METRICS
+from ssad.metrics.uncertainty import Kind
+from ssad.report.load import Run
+from ssad.report.records import Line, metric_cell
+from ssad.report.tables import Table, TableCell, TableRow
+from ssad.report.terminal import TerminalRow, TerminalTable
+
+SWEEP: Final = "sweep."
+"""Start of the names of the fields that have the values of swept parameters."""
+MAX_SLICES: Final = 6
+"""Most values of further parameters that have matrices of their own; over more of them the matrix is a mean."""
+BETWEEN: Final = " \\ "  # between the parameters in the rows and in the columns
+EMPTY: Final = TableCell.value(None)
+NOTE: Final = (
+    "Points of a grid share their route and their random draws: they are one cluster, and no interval is taken over "
+    "them. A mean over a grid describes the grid, not how often something happens on the road."
+)
+
+
+def swept_parameters(run: Run) -> list[str]:
+    """Return the swept parameters of a run, in the order of its suite; empty: it has no sweep."""
+    names = dict.fromkeys(name for line in run.lines for name in line if name.startswith(SWEEP))
+    return [name.removeprefix(SWEEP) for name in names]
+
+
+def sweep_tables(run: Run) -> list[Table]:
+    """Return the matrices of a run with a sweep, and the table of all its points; empty: it has no sweep."""
+    if not swept_parameters(run):
+        return []
+    return [*run_matrices(run), _point_table(run)]
+
+
+def run_matrices(run: Run) -> list[Table]:
+    """Return the matrices of a run, of the metric and with the rows and columns that its suite names."""
+    name = str(run.suite.get("matrix_metric") or "CR")
+    titles = {column["name"]: column for column in run.header.get("columns") or []}
+    is_recorded = any(name in (line.get("metrics") or {}) for line in run.lines)
+    metric = METRICS[name].field or name if name in METRICS and not is_recorded else name
+    column = titles.get(name) or {}
+    unit = f", {column['unit']}" if column.get("unit") else ""
+    title = f"{column.get('title') or name}{unit}"
+    axes = [str(axis) for axis in run.suite.get("matrix") or ()]
+    return matrix_tables(run, metric, title[:1].upper() + title[1:], kind=_kind_of(run.lines, metric), axes=axes)
+
+
+def _kind_of(lines: Sequence[Line], metric: str) -> Kind:
+    """Return the kind of the values of a metric: shares are truth values, or 0 and 1 alone."""
+    values = [value for line in lines if (value := (line.get("metrics") or {}).get(metric)) is not None]
+    return "share" if values and all(value in (0, 1) for value in values) else "mean"
+
+
+def matrix_tables(run: Run, metric: str, title: str, *, kind: Kind = "share", axes: Sequence[str] = ()) -> list[Table]:
+    """Return the matrix tables of a run with a sweep.
+
+    Args:
+        run: The run.
+        metric: Metric of the records that the cells show.
+        title: Title of the metric.
+        kind: Kind of its values; see `ssad.metrics.uncertainty.estimate`.
+        axes: Parameters in the rows and the columns; empty: the first two that have several values.
+
+    Returns:
+        For each system and scenario, a table for each value of the other parameters, or one of the mean over them
+        where they have more than `MAX_SLICES` values. With one parameter, systems are the columns. Empty: no sweep.
+    """
+    lines = [line for line in run.lines if any(name.startswith(SWEEP) for name in line)]
+    if not lines:
+        return []
+    parameters = swept_parameters(run)
+    varied = [name for name in parameters if len(_values(lines, name)) > 1] or parameters
+    chosen = [name for name in axes if name in parameters]  # a scenario of its own may lack one
+    row_name, *column_names = [*chosen, *(name for name in varied if name not in chosen)][:2]
+    column_name = column_names[0] if column_names else ""
+    others = [name for name in varied if name not in (row_name, column_name)]
+    slices = _slices(lines, others)
+    is_mean = len(slices) > MAX_SLICES
+    has_several_scenarios = len(_groups(lines, "swept")) > 1
+    tables: list[Table] = []
+    for scenario, scenario_lines in _groups(lines, "swept").items():
+        for system, group_lines in (_groups(scenario_lines, "system") if column_name else {"": scenario_lines}).items():
+            for point in [{}] if is_mean else slices:
+                slice_lines = [line for line in group_lines if _is_at(line, point)]
+                if not slice_lines:
+                    continue
+                point_texts = [f"{name} = {_text(value)}" for name, value in point.items()]
+                subject = ", ".join(filter(None, [system, scenario if has_several_scenarios else "", *point_texts]))
+                rows = _matrix_rows(slice_lines, row_name, column_name, lambda cases: metric_cell(cases, metric, kind))
+                tables.append(
+                    Table(
+                        f"matrix-{len(tables) + 1}" if tables else "matrix",
+                        f"{title}: {subject}" if subject else title,
+                        (BETWEEN.join(_with_unit(lines, name) for name in (row_name, column_name) if name),),
+                        tuple(_text(value) for value in _column_values(slice_lines, column_name)),
+                        rows,
+                        note=f"{_count_note(rows, _mean_note(lines, others) if is_mean else '')} {NOTE}",
+                    )
+                )
+    return tables
+
+
+def _matrix_rows(
+    lines: Sequence[Line], row_name: str, column_name: str, cell_of: Callable[[Sequence[Line]], TableCell]
+) -> tuple[TableRow, ...]:
+    """Return the rows of a matrix; a point that no line has is empty."""
+    members: dict[tuple[Any, Any], list[Line]] = {}
+    for line in lines:
+        column_value = line.get(SWEEP + column_name) if column_name else line.get("system", "")
+        members.setdefault((line.get(SWEEP + row_name), column_value), []).append(line)
+    return tuple(
+        TableRow(
+            (_text(row_value),),
+            tuple(
+                cell_of(members[row_value, column_value]) if (row_value, column_value) in members else EMPTY
+                for column_value in _column_values(lines, column_name)
+            ),
+        )
+        for row_value in _values(lines, row_name)
+    )
+
+
+def _column_values(lines: Sequence[Line], column_name: str) -> list[Any]:
+    """Return the values of the parameter in the columns; the systems without one."""
+    return _values(lines, column_name) if column_name else list(_groups(lines, "system"))
+
+
+def _point_table(run: Run) -> Table:
+    """Return the table of all points of a sweep and all metrics, a row a point, for further computation."""
+    metrics = dict.fromkeys(
+        metric
+        for line in run.lines
+        for metric, value in (line.get("metrics") or {}).items()
+        if value is None or _is_number(value)
+    )
+    return Table.pivot(
+        "sweep",
+        "Points of the sweep",
+        [line for line in run.lines if "swept" in line],
+        rows={
+            "System": lambda line: line.get("system", ""),
+            "Scenario": lambda line: line["swept"],
+            **{name: _parameter_factor(name) for name in swept_parameters(run)},
+        },
+        columns={name: name for name in metrics},
+        metric=lambda lines, name: metric_cell(lines, name, _kind_of(run.lines, name)),
+        note=NOTE,
+    )
+
+
+def _parameter_factor(name: str) -> Any:
+    return lambda line: _text(line[SWEEP + name]) if SWEEP + name in line else ""
+
+
+def _count_note(rows: Iterable[TableRow], mean_note: str) -> str:
+    """Return in sentences how many cases are behind the numbers of a matrix."""
+    filled = [cell for row in rows for cell in row.cells if cell.n or cell.failed]
+    if not filled:
+        return "No drive of these points ran."
+    fewest, most = min(cell.n for cell in filled), max(cell.n for cell in filled)
+    clusters = max(cell.clusters for cell in filled)
+    count = str(fewest) if fewest == most else f"{fewest} to {most}"
+    cluster_text = f" in {clusters} cluster{'s' if clusters > 1 else ''}" if most > 1 else ""
+    noun = "drive" if most == 1 else "drives"
+    return f"{mean_note or 'Each number is of one point of the grid.'} n = {count} {noun} behind it{cluster_text}."
+
+
+def _mean_note(lines: Sequence[Line], others: Sequence[str]) -> str:
+    listed = ", ".join(f"{name} ({len(_values(lines, name))} values)" for name in others)
+    return f"Each number is the mean over {listed}."
+
+
+def _slices(lines: Sequence[Line], names: Sequence[str]) -> list[dict[str, float]]:
+    """Return the combinations of values of parameters that occur, in the order of their first occurrence."""
+    points = dict.fromkeys(tuple(line.get(SWEEP + name, math.nan) for name in names) for line in lines)
+    return [dict(zip(names, point, strict=True)) for point in points]
+
+
+def _is_at(line: Line, point: Mapping[str, float]) -> bool:
+    return all(line.get(SWEEP + name) == value for name, value in point.items())
+
+
+def _groups(lines: Sequence[Line], field_name: str) -> dict[str, list[Line]]:
+    groups: dict[str, list[Line]] = {}
+    for line in lines:
+        groups.setdefault(str(line.get(field_name, "")), []).append(line)
+    return groups
+
+
+def _values(lines: Sequence[Line], parameter: str) -> list[float]:
+    """Return the values of a swept parameter, in ascending order."""
+    return sorted({value for line in lines if _is_number(value := line.get(SWEEP + parameter))})
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.12g}" if _is_number(value) else str(value)
+
+
+def _with_unit(lines: Sequence[Line], parameter: str) -> str:
+    """Return the name of a parameter with the unit that its scenario declares."""
+    scenario = (lines[0].get("spec") or {}).get("scenario") or {}
+    declaration = (scenario.get("parameters") or {}).get(parameter)
+    unit = declaration.get("unit", "") if isinstance(declaration, Mapping) else ""
+    return f"{parameter}, {unit}" if unit else parameter
+
+
+def terminal_matrices(run: Run) -> list[TerminalTable]:
+    """Return the matrices of a run for the terminal, the last one with their notes; empty: it has no sweep."""
+    tables = run_matrices(run)
+    notes = dict.fromkeys(table.note for table in tables)
+    matrices = []
+    for table in tables:
+        row_head, _, column_head = table.heads[0].partition(BETWEEN)
+        rows = (TerminalRow((*row.head, *(matrix_text(cell, table) for cell in row.cells))) for row in table.rows)
+        matrices.append(
+            TerminalTable(
+                f"{table.title} (columns: {column_head})" if column_head else table.title,
+                (row_head, *table.columns),
+                tuple(rows),
+                head_count=1,
+                note="\n".join(notes) if table is tables[-1] else "",
+            )
+        )
+    return matrices
+
+
+def matrix_text(cell: TableCell, table: Table) -> str:
+    """Return the text of a cell of a matrix: empty where nothing ran, 0 or 1 where all cells are one of them."""
+    means = [other.mean for row in table.rows for other in row.cells if not math.isnan(other.mean)]
+    if math.isnan(cell.mean):
+        return ""
+    return f"{cell.mean:.0f}" if all(mean in (0.0, 1.0) for mean in means) else cell.text
+
+
+def shade(cell: TableCell, table: Table) -> str:
+    """Return the background of a cell of a matrix, as a CSS colour mix: from 0 to 1, or to the largest number."""
+    largest = max((c.mean for row in table.rows for c in row.cells if not math.isnan(c.mean)), default=1.0)
+    value = cell.mean if not (cell.failed and not math.isnan(cell.high)) else cell.high
+    if math.isnan(value):
+        return ""
+    return f"--bad:{100 * min(max(value / max(largest, 1.0), 0.0), 1.0):.0f}%"
