@@ -27,6 +27,7 @@ from ssad.world.roads import import_map, town_xodr
 TOWN = "Oldmarket"
 SPACING = 1000.0  # m between the copies of the town
 COLUMNS = 10
+REPEATS = 3  # the least time counts: other work on the machine only adds to it
 OFFSET = 100_000  # between the ids of one copy and of the next
 NUMBERED = {  # attributes that name roads, junctions and signals
     "road": ("id", "junction"),
@@ -85,7 +86,7 @@ def main() -> None:
         path = arguments.map or Path(folder) / "copies.xodr"
         if arguments.map is None:
             path.write_bytes(large_map(1e6 * arguments.megabytes))
-        seconds, count, kilometres = measure(path)
+        seconds, count, kilometres = min(measure(path) for _ in range(REPEATS))
         size = path.stat().st_size / 1e6
     name = arguments.map.name if arguments.map else f"copies of {TOWN}"
     lines = ["| map | size, MB | time, s | drivable lanes | their length, km |", "|---|---:|---:|---:|---:|"]

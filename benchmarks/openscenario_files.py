@@ -1,14 +1,16 @@
 """Import of public OpenSCENARIO files, and how much of each is carried over.
 
-    python benchmarks/openscenario_files.py docs/results/openscenario-imports.md NAME@COMMIT=FOLDER...
+    python -m benchmarks.openscenario_files --page NAME@COMMIT=FOLDER...
 
 Each folder, such as a part of a checkout of a public repository at the commit that its name states, is searched for
 `.xosc` files with a storyboard or a distribution of parameters. Towns that the files do not bring are taken from
 SSAD_HOME; maps that come with the files are imported to a folder of their own. The files are no part of SSAD.
+`--page` writes docs/results/openscenario-imports.md.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
@@ -19,37 +21,15 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from benchmarks.insert import insert, store_commit
 from ssad.core.errors import SSADError
-from ssad.core.safeio import home_folder, write_atomic
+from ssad.core.safeio import home_folder
 from ssad.interchange.openscenario_document import read_document
 from ssad.interchange.openscenario_reader import read_openscenario_set
 
 MOST = 20  # scenarios read of a distribution
 SHOWN = 25  # reasons
-PAGE = """# Public OpenSCENARIO files
-
-> **Stored result.** Weights: none. Torch: not used. Make it anew: `python benchmarks/openscenario_files.py OUT.md \
-NAME@COMMIT=FOLDER...`, with checkouts of the repositories below.
-
-*Import*: `ssad import openscenario` makes scenarios of the file, and each builds as an episode on its map. *All
-motion*: everything that moves an actor is carried over. Weather, lights, variables, what the ego is told to do, and
-ends of the episode other than by time and distance do not count; they are listed below. Of a distribution, at most
-{most} sets of values are read. Times are CPU seconds of one core, with the import of the map.
-
-| Files of | commit | files | import | share | all motion | actors | longest, s |
-|---|---|---:|---:|---:|---:|---:|---:|
-{rows}
-
-## Files that do not import
-{errors}
-
-## What is not carried over
-Files of all folders, by reason.
-
-| Reason | files |
-|---|---:|
-{reasons}
-"""
+PAGE = "results/openscenario-imports.md"
 # What has no part in the motion of actors.
 APPEARANCE = re.compile(
     r"EnvironmentAction|LightStateAction|SetAction|VariableCondition|VisibilityAction|ControllerAction|controller"
@@ -105,9 +85,13 @@ def check_file(path: Path) -> Result:
     return result
 
 
-def page(folders: dict[str, list[Result]]) -> str:
-    """Return the page on the files of folders, by names such as owner/repository@commit."""
-    rows, errors = [], []
+def report_lines(folders: dict[str, list[Result]]) -> dict[str, list[str]]:
+    """Return the lines of each part of the page on the files of folders, by names such as owner/repository@commit."""
+    rows = [
+        "| Files of | commit | files | import | share | all motion | actors | longest, s |",
+        "|---|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    errors = []
     reasons: Counter[str] = Counter()
     for name, results in folders.items():
         good = [result for result in results if not result.error]
@@ -126,8 +110,9 @@ def page(folders: dict[str, list[Result]]) -> str:
         errors += [f"* {repository}: {result.error}" for result in results if result.error]
         for result in good:
             reasons.update({_general(reason) for reason in result.omissions})
-    lines = [f"| {reason} | {count} |" for reason, count in reasons.most_common(SHOWN)]
-    return PAGE.format(most=MOST, rows="\n".join(rows), errors="\n".join(errors) or "None.", reasons="\n".join(lines))
+    lines = ["| Reason | files |", "|---|---:|"]
+    lines += [f"| {reason} | {count} |" for reason, count in reasons.most_common(SHOWN)]
+    return {"files": rows, "errors": errors or ["None."], "reasons": lines}
 
 
 def _general(reason: str) -> str:
@@ -135,15 +120,19 @@ def _general(reason: str) -> str:
     return re.sub(r"(?<![A-Za-z])-?\d+(\.\d+)?", "n", re.sub(r"'[^']*'", "…", reason)).replace("|", "/")
 
 
-def main(out: str, *folders: str) -> None:
-    """Import the files of NAME=FOLDER arguments and write the page."""
+def main() -> None:
+    """Import the files of NAME=FOLDER arguments, print, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", metavar="NAME@COMMIT=FOLDER")
+    parser.add_argument("--page", action="store_true", help=f"write docs/{PAGE}")
+    arguments = parser.parse_args()
     towns = home_folder() / "towns"
     results: dict[str, list[Result]] = {}
     with tempfile.TemporaryDirectory() as home:
         if towns.is_dir():
             shutil.copytree(towns, Path(home) / "towns")
         os.environ["SSAD_HOME"] = home
-        for argument in folders:
+        for argument in arguments.folders:
             name, _, folder = argument.rpartition("=")
             paths = [path for path in sorted(Path(folder).glob("*.xosc")) if is_scenario(path)]
             name = name or Path(folder).name
@@ -151,8 +140,13 @@ def main(out: str, *folders: str) -> None:
             for number, path in enumerate(paths, 1):
                 results[name].append(check_file(path))
                 print(f"{name}: {number} of {len(paths)}", file=sys.stderr)
-    write_atomic(Path(out), page(results))
+    parts = report_lines(results)
+    print("\n".join(line for lines in parts.values() for line in lines))
+    if arguments.page:
+        for mark, lines in parts.items():
+            insert(PAGE, mark, ["", *lines, ""])
+        store_commit(PAGE)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -13,7 +13,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import Actor, AgentKind, EpisodeLimits, Pose
 from ssad.interchange.commonroad_xml import KINDS_OF, STEP, TextReader, element_name
 from ssad.world.episode_arrays import MAX_AGENTS
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, SURROGATES
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -84,7 +84,9 @@ class ObstacleReader:
         if not kinds:
             raise self.texts.error(element, f"'{type_name[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
         size = self._size(element)
-        candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
+        candidates = [
+            candidate for name, candidate in MODELS.items() if candidate.kind in kinds and name not in SURROGATES
+        ]
         model = min(candidates, key=lambda candidate: abs(candidate.length - size[0]) + abs(candidate.width - size[1]))
         if max(abs(model.length - size[0]), abs(model.width - size[1])) > 0.01:
             self.report.omit(

@@ -34,8 +34,5 @@ def start_parameters(route: Route, pose: Pose, speed: float, *, digits: int) -> 
         "ego_heading": float(wrap_angle(pose.yaw - yaw)),
     }
     ranges = parameter_box(CUSTOM)
-    clipped = {
-        name: round(float(np.clip(number, ranges[name].low, ranges[name].high)), digits)
-        for name, number in values.items()
-    }
+    clipped = {name: round(float(np.clip(number, *ranges[name].limits)), digits) for name, number in values.items()}
     return {name: value for name, value in clipped.items() if value != 0.0}

@@ -42,7 +42,7 @@ def scenario_file(root: Element, path: Path) -> Path | None:
     if element is None:
         raise values.error(distribution, "ScenarioFile is missing")
     scenario = path.parent / values.text(element, "filepath").replace("\\", "/")
-    if scenario.suffix != ".xosc" or not scenario.is_file():
+    if scenario.suffix != ".xosc" or Path(element.get("filepath", "")).is_absolute() or not scenario.is_file():
         raise values.error(
             element, f"there is no scenario '{element.get('filepath', '')[:120]}'; put it beside the file"
         )

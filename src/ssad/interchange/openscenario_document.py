@@ -299,10 +299,11 @@ class _Catalogues:
     """Catalogues of the folders that a document names."""
 
     def __init__(self, root: Element, path: Path, scope: Scope) -> None:
-        self.folders = [
-            path.parent / scope.text(directory, "path", directory.get("path", "")).replace("\\", "/")
+        stated = [
+            scope.text(directory, "path", directory.get("path", "")).replace("\\", "/")
             for directory in root.iterfind("CatalogLocations/*/Directory")
         ]
+        self.folders = [path.parent / folder for folder in stated if not Path(folder).is_absolute()]
         self._catalogues: dict[str, dict[str, Element]] | None = None
 
     def entry(self, reference: Element) -> Element | None:

@@ -28,6 +28,7 @@ from ssad.interchange.openscenario_triggers import (
     all_of,
     any_of,
     both,
+    conjuncts,
     is_lasting,
 )
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, move_pose, place_ahead, place_behind, pose_at
@@ -117,6 +118,7 @@ class StoryboardReader:
         self.ego = self.triggers.ego
         self._names: set[str] = set()
         self._lanes: dict[str, int] = {}  # lanes to the left of the start, after the lateral phases so far
+        self._offsets: dict[str, float] = {}  # m from the centre of that lane
         self._starts: dict[int, Trigger] = {}
         self._open: set[int] = set()
         self.stories = [self._element(story, None) for story in root.iterfind("Storyboard/Story")]
@@ -239,7 +241,7 @@ class StoryboardReader:
             self.record_omission(f"in event '{label}'", action)
             return
         entity = self.triggers.referenced_entity(entity_action)
-        time = self._time(self.start(event, entity))
+        time = self._time(self._begin(event, entity))
         is_arrival = entity_action.find("AddEntityAction") is not None
         if time is None or math.isinf(time):
             if time is None:
@@ -262,6 +264,14 @@ class StoryboardReader:
         return max(known) if len(known) == len(times) and trigger.rule != "below" else None
 
     # ------------------------------------------------------------ triggers of elements
+
+    def _begin(self, event: StoryElement, entity: Entity) -> Trigger:
+        """Return the trigger of an event that is carried out; it must not wait for itself."""
+        self._open.add(id(event))
+        try:
+            return self.start(event, entity)
+        finally:
+            self._open.discard(id(event))
 
     def start(self, event: StoryElement, entity: Entity | None) -> Trigger:
         """Return the trigger of an event: its own and that of its act."""
@@ -298,14 +308,18 @@ class StoryboardReader:
             if item.path[-len(parts) :] == parts and kind.lower() in ("", item.element.tag.lower())
         ]
         if not candidates:
-            place = f"{getattr(content, 'source', '')}:{getattr(content, 'line', 0)}"
-            reason = f"there is no {kind or 'element'} '{name[:60]}'"
-            self.report.doubt(f"the trigger of '{label}' can never fire: {reason}", place)
-            return Unfulfilled.NEVER
+            return self.triggers.never(content, label, f"there is no {kind or 'element'} '{name[:60]}'")
+        item = candidates[0]
+        events = [part for part in item.every() if part.element.tag == "Event"]
+        if item.element.tag == "Action" and item.parent is not None:
+            events = [item.parent]
+        begins = [self._takes_place(event, content, label) for event in events]
+        if begins and not any(isinstance(trigger, PhaseTrigger) for trigger in begins):
+            return begins[0]
         if state in ("startTransition", "runningState"):
-            return self._begun(candidates[0], content, label)
+            return self._begun(item, content, label)
         if state in ("endTransition", "completeState", "stopTransition", "skipTransition"):
-            return self._ended(candidates[0], content, label)
+            return self._ended(item, content, label)
         return ALWAYS if state == "standbyState" else Unfulfilled.UNKNOWN
 
     def _begun(self, item: StoryElement, content: Element, label: str) -> Trigger:
@@ -322,6 +336,15 @@ class StoryboardReader:
             events = [item.parent]
         return any_of([self._guarded(event, content, label, partial(self._event_start, event)) for event in events])
 
+    def _takes_place(self, event: StoryElement, content: Element, label: str) -> Trigger:
+        """Return the start of an event, for whether it has one; nothing is counted as an omission."""
+        counted = dict(self.omissions)
+        try:
+            return self._guarded(event, content, label, partial(self.start, event, None))
+        finally:
+            self.omissions.clear()
+            self.omissions.update(counted)
+
     def _act_start(self, act: StoryElement) -> Trigger:
         return self.triggers.trigger(act.element.find("StartTrigger"), None, act.path[-1])
 
@@ -337,15 +360,14 @@ class StoryboardReader:
         if key in self._starts:
             return self._starts[key]
         if key in self._open:
-            place = f"{getattr(content, 'source', '')}:{getattr(content, 'line', 0)}"
-            self.report.doubt(f"the trigger of '{label}' can never fire: events wait for each other", place)
-            return Unfulfilled.NEVER
+            return self.triggers.never(content, label, "events wait for each other")
         self._open.add(key)
         try:
-            self._starts[key] = make()
+            result = make()
         finally:
             self._open.discard(key)
-        return self._starts[key]
+        self._starts[key] = result
+        return result
 
     def _ended(self, item: StoryElement, content: Element, label: str) -> Trigger:
         if not item.phases and item.element.tag == "Action":
@@ -354,9 +376,14 @@ class StoryboardReader:
             # The last phase of an action ends it, for each of its entities.
             last = dict(item.phases)
             return all_of([PhaseTrigger("phase_end", agent=name, phase=phase) for name, phase in last.items()])
-        parts = [self._ended(child, content, label) for child in item.children]
-        if Unfulfilled.NEVER in parts and item.element.tag in ("ManeuverGroup", "Maneuver", "Act", "Story"):
-            parts = [part for part in parts if part is not Unfulfilled.NEVER] or parts
+        if any(id(child) in self._open for child in item.every()):
+            return self.triggers.never(content, label, "events wait for each other")
+        children = [
+            child
+            for child in item.children
+            if child.element.tag != "Event" or isinstance(self._takes_place(child, content, label), PhaseTrigger)
+        ]
+        parts = [self._ended(child, content, label) for child in children]
         return all_of(parts) if parts else self._begun(item, content, label)
 
     def _after_start(self, action: StoryElement, content: Element, label: str) -> Trigger:
@@ -427,7 +454,7 @@ class StoryboardReader:
         if entity.ego:
             tags = {element.tag for element in (content, *content)}
             routing = content if content.tag == "RoutingAction" else content.find("RoutingAction")
-            trigger = self.start(event, entity)
+            trigger = self._begin(event, entity)
             if routing is not None and isinstance(trigger, PhaseTrigger) and not (entity.route or entity.path):
                 self._routing(entity, routing, action, trigger, f"event '{label}'")
             elif tags & set(_OF_DRIVER) - {"ControllerAction"}:
@@ -435,7 +462,7 @@ class StoryboardReader:
             elif "ControllerAction" not in tags:
                 self.record_omission(f"in event '{label}'", content)
             return
-        trigger = self.start(event, entity)
+        trigger = self._begin(event, entity)
         if trigger is Unfulfilled.NEVER:
             return
         if trigger is Unfulfilled.UNKNOWN:
@@ -635,6 +662,7 @@ class StoryboardReader:
             return None
         self._lanes[entity.name] = total
         phase = LateralPhase(total - before, offset=self.values.number(action, "targetLaneOffset", 0.0))
+        self._offsets[entity.name] = phase.offset
         dynamics = action.find("LaneChangeActionDynamics")
         if dynamics is None:
             raise self.values.error(action, "LaneChangeActionDynamics is missing")
@@ -696,6 +724,7 @@ class StoryboardReader:
                 f"the lane offset of '{entity.name}' relative to another is taken from the lane's centre"
             ] += 1
         phase = LateralPhase(0, offset=value)
+        before, self._offsets[entity.name] = self._offsets.get(entity.name, 0.0), value
         dynamics = action.find("LaneOffsetActionDynamics")
         shape = "sinusoidal" if dynamics is None else self.values.text(dynamics, "dynamicsShape", "sinusoidal")
         if shape not in _SHAPES:
@@ -706,7 +735,7 @@ class StoryboardReader:
         if limit <= 0.0:
             return replace(phase, shape=shape, duration=LATERAL_TIME)  # type: ignore[arg-type]
         # Half a cosine over d metres in T seconds has an acceleration of at most pi^2 d / (2 T^2).
-        moved = max(abs(value - (entity.lateral[-1].offset if entity.lateral else 0.0)), 0.1)
+        moved = max(abs(value - before), 0.1)
         return replace(phase, shape=shape, duration=math.pi * math.sqrt(0.5 * moved / limit))  # type: ignore[arg-type]
 
     # ------------------------------------------------------------ distances
@@ -882,17 +911,23 @@ def _in_sequence(phases: Sequence, entity: str) -> list:  # type: ignore[type-ar
     """Return phases without conditions that their order gives: one waits for the one before it."""
     result: list = []  # type: ignore[type-arg]
     for index, phase in enumerate(phases):
-        before = phases[index - 1].name if index else ""
-        begun = PhaseTrigger("phase_start", agent=entity, phase=before)
-        parts = phase.when.all if phase.when == PhaseTrigger(all=phase.when.all) and phase.when.all else (phase.when,)
-        waiting = [part for part in parts if replace(part, delay=0.0) == begun]
-        rest = tuple(part for part in parts if part not in waiting)
+        parts = conjuncts(phase.when)
+        # A phase behind one that may begin at any time waits for those before that, too.
+        required = list[str]()
+        for other in reversed(result):
+            required.append(other.name)
+            if not other.anytime:
+                break
+        begun = {name: PhaseTrigger("phase_start", agent=entity, phase=name) for name in required}
+        late = [part for part in parts if required and replace(part, delay=0.0) == begun[required[0]] and part.delay]
+        ended = {part.phase for part in parts if part.kind == "phase_end" and part.agent == entity}
         if index == 0:
             result.append(replace(phase, anytime=False))
-        elif not waiting or (waiting[0].delay and rest):
-            result.append(phase)
+        elif late and len(parts) == len(required) == 1:
+            result.append(replace(phase, when=PhaseTrigger("after", late[0].delay), anytime=False))
+        elif all(begun[name] in parts or name in ended for name in required):
+            rest = [part for part in parts if part not in begun.values()]
+            result.append(replace(phase, when=all_of(rest) if rest else ALWAYS, anytime=False))
         else:
-            delay = waiting[0].delay
-            when = PhaseTrigger("after", delay) if delay else all_of(rest) if rest else ALWAYS
-            result.append(replace(phase, when=when, anytime=False))
+            result.append(phase)
     return result

@@ -78,18 +78,25 @@ def any_of(parts: Sequence[Trigger]) -> Trigger:
     if ALWAYS in triggers:
         return ALWAYS
     triggers = [part for part in triggers if not any(_implies(part, other) for other in triggers if other is not part)]
-    return triggers[0] if len(triggers) == 1 else PhaseTrigger(any=tuple(triggers))
+    if len(triggers) == 1:
+        return triggers[0]
+    shared = [part for part in conjuncts(triggers[0]) if all(part in conjuncts(other) for other in triggers)]
+    if not shared:
+        return PhaseTrigger(any=tuple(triggers))
+    rest = [all_of([part for part in conjuncts(trigger) if part not in shared] or [ALWAYS]) for trigger in triggers]
+    return all_of([*shared, any_of(rest)])
 
 
-def _conjuncts(trigger: PhaseTrigger) -> set[PhaseTrigger]:
-    return set(trigger.all) if trigger.kind == "always" and trigger.all and not trigger.any else {trigger}
+def conjuncts(trigger: PhaseTrigger) -> tuple[PhaseTrigger, ...]:
+    """Return the triggers that must all hold for a trigger to hold."""
+    return trigger.all if trigger.all and trigger == PhaseTrigger(all=trigger.all) else (trigger,)
 
 
 def _implies(trigger: PhaseTrigger, other: PhaseTrigger) -> bool:
     """Return whether one trigger holds only where another does, as far as their parts show."""
-    parts = _conjuncts(trigger)
+    parts = set(conjuncts(trigger))
     begun = {replace(part, kind="phase_start") for part in parts if part.kind == "phase_end"}
-    required = _conjuncts(other)
+    required = set(conjuncts(other))
     return required <= parts | begun and not (parts <= required)
 
 
@@ -174,8 +181,7 @@ class TriggerReader:
         if not isinstance(result, PhaseTrigger):
             return result
         if edge == "falling" and is_lasting(result):
-            self._never(condition, label, "it waits for the end of a condition that never ends")
-            return Unfulfilled.NEVER
+            return self.never(condition, label, "it waits for the end of a condition that never ends")
         if edge != "none" and not is_lasting(result):
             kind = {"risingOrFalling": "both"}.get(edge, edge)
             result = replace(result, edge=kind)  # type: ignore[arg-type]
@@ -187,10 +193,13 @@ class TriggerReader:
             return replace(result, value=result.value + delay)
         return replace(result, delay=delay)
 
-    def _never(self, element: Element, label: str, reason: str) -> None:
-        """Report that a trigger can never hold."""
+    def never(self, element: Element, label: str, reason: str) -> Unfulfilled:
+        """Report that a trigger can never hold, once for each place."""
         place = f"{getattr(element, 'source', '')}:{getattr(element, 'line', 0)}"
-        self.report.doubt(f"the trigger of '{label}' can never fire: {reason}", place)
+        message = f"the trigger of '{label}' can never fire: {reason}"
+        if place not in self.report.doubts.get(message, ()):
+            self.report.doubt(message, place)
+        return Unfulfilled.NEVER
 
     # ------------------------------------------------------------ conditions on values
 
@@ -200,8 +209,7 @@ class TriggerReader:
             value = self.values.number(content, "value")
             if rule in _BELOW:
                 if value <= 0.0:
-                    self._never(content, label, f"the time is never below {value:g} s")
-                    return Unfulfilled.NEVER
+                    return self.never(content, label, f"the time is never below {value:g} s")
                 return PhaseTrigger("time", value, rule="below")
             return PhaseTrigger("time", value) if value > 0.0 else ALWAYS
         if content.tag == "ParameterCondition":
@@ -322,8 +330,7 @@ class TriggerReader:
             return replace(trigger, value=value, rule="" if is_rising_kind else "above")
         if rule in _BELOW:
             if value <= 0.0 and trigger.kind not in ("relative_speed", "acceleration"):
-                self._never(content, label, f"{content.tag} is never below {value:g}")
-                return Unfulfilled.NEVER
+                return self.never(content, label, f"{content.tag} is never below {value:g}")
             return replace(trigger, value=value, rule="below" if is_rising_kind else "")
         if rule == "equalTo":
             above = replace(trigger, value=value - EQUAL, rule="above")

@@ -318,7 +318,8 @@ class _Writer:
             if not phases:
                 continue
             maneuver = _node(group, "Maneuver", name=f"every {title} of {name}")
-            before, speed = "", agent.speed
+            before: list[str] = []  # events that a phase waits for
+            speed = agent.speed
             for index, phase in enumerate(phases):
                 label = self.events[name, title, index]
                 event = self._event(maneuver, label, "override")
@@ -329,7 +330,7 @@ class _Writer:
                     self._write_speed_phase(action, agent, phase, speed)
                     speed = phase.speed or 0.0
                 self._write_trigger(event, name, phase, before)
-                before = label
+                before = [label, *before] if phase.anytime else [label]
         if agent.lateral:
             self.omissions.append(f"{name} changes lanes on its path: other programs leave the path then")
 
@@ -419,14 +420,15 @@ class _Writer:
             _write_position(vertex, pose)
         return follow_action
 
-    def _write_trigger(self, event: Element, name: str, phase: Phase | LateralPhase, before: str) -> None:
-        """Write the trigger of a phase, which also waits for the event before it unless it may begin at any time."""
+    def _write_trigger(self, event: Element, name: str, phase: Phase | LateralPhase, before: Sequence[str]) -> None:
+        """Write the trigger of a phase, which also waits for the events before it unless it may begin at any time."""
         trigger = _node(event, "StartTrigger")
         label = event.get("name", "")
         for conditions in trigger_groups(phase.when):
             states = [state for condition in conditions if (state := self._state(condition, name, before))]
-            if before and not phase.anytime and before not in [state[0] for state in states]:
-                states.append((before, 0.0, True))
+            if not phase.anytime:
+                stated = [state[0] for state in states]
+                states += [(other, 0.0, True) for other in before if other not in stated]
             others = [condition for condition in conditions if self._state(condition, name, before) is None]
             others = [condition for condition in others if condition.kind != "always"] or others[: not states]
             # The format has no state "has begun": an event that has begun runs, or is complete.
@@ -438,10 +440,10 @@ class _Writer:
                 for (other, delay, _), other_state in zip(states, way, strict=True):
                     self._write_state(group, f"{label} after {other}", other, other_state, delay)
 
-    def _state(self, condition: PhaseTrigger, name: str, before: str) -> tuple[str, float, bool] | None:
+    def _state(self, condition: PhaseTrigger, name: str, before: Sequence[str]) -> tuple[str, float, bool] | None:
         """Return event, delay, and whether it has begun, not ended, for a condition on an event; None: on others."""
         if condition.kind == "after" and before:
-            return before, condition.value + condition.delay, True
+            return before[0], condition.value + condition.delay, True
         if condition.kind in ("phase_start", "phase_end"):
             event = self._event_of(condition.agent or name, condition.phase)
             return event, condition.delay, condition.kind == "phase_start"

@@ -22,7 +22,7 @@ from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
-from ssad.world.models import stated_size, trace_sizes
+from ssad.world.models import SURROGATES, stated_size, trace_sizes
 
 Size = tuple[float, float, float]  # length, width, height
 KERB = 0.12  # m, height of sidewalks
@@ -336,13 +336,15 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         )
         active = trace.active[:, agent]
         model_size = sizes[agent]
-        is_stated = bool(trace.heights) and bool(stated_size(trace.models[agent], model_size))
+        is_exact = trace.models[agent] in SURROGATES or (
+            bool(trace.heights) and bool(stated_size(trace.models[agent], model_size))
+        )
         if trace.models[agent] not in ACTOR_BODIES:
             population.add(("", "", model_size, (population.meshes.add(plain_body(model_size)),)), track, active=active)
             continue
         kind, styles = ACTOR_BODIES[trace.models[agent]]
         style = styles[int(rng.integers(len(styles)))]
-        if kind == "bus" and rng.random() < 0.45 and not is_stated:
+        if kind == "bus" and rng.random() < 0.45 and not is_exact:
             _add_tractor(population, track, active, rng)
             continue
         if kind == "truck" and rng.random() < 0.3:
@@ -350,7 +352,7 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         drawn_size = draw_size(kind, style, generator=rng)
         # A body must not exceed the footprint that the world uses for contacts.
         size = (min(drawn_size[0], model_size[0]), min(drawn_size[1], model_size[1]), drawn_size[2])
-        if is_stated:
+        if is_exact:
             size = model_size
         phases = PHASES if kind in ("pedestrian", "bicycle") else 1
         population.add(population.make(kind, style, size, phases=phases), track, active=active)

@@ -32,6 +32,18 @@ def _vehicle(  # noqa: PLR0917
     return Model(name, kind, *size, 0.58 * size[0], _STEER, accel, brake, speed)
 
 
+# Dimensions and wheelbases: vectorgrp/OSC-NCAP-scenarios ee7aa11, catalogues of vehicles and pedestrians. Two-wheelers
+# are as high as the world's own riders.
+_SURROGATES = (
+    Model("euroncap_adult", AgentKind.WALKER, 0.60, 0.50, 1.80, max_accel=20.0, max_brake=20.0, max_speed=4.0),
+    Model("euroncap_child", AgentKind.WALKER, 0.711, 0.298, 1.154, max_accel=20.0, max_brake=20.0, max_speed=4.0),
+    Model("euroncap_bicycle", AgentKind.BICYCLE, 1.89, 0.50, 1.75, 1.21, _STEER, 2.0, 8.0, 14.0),
+    Model("euroncap_motorcycle", AgentKind.MOTORCYCLE, 2.08, 0.79, 1.60, 1.41, _STEER, 8.0, 10.0, 70.0),
+    Model("euroncap_vehicle", AgentKind.CAR, 4.023, 1.712, 1.427, 2.475, _STEER, 5.0, 10.0, 70.0),
+)
+SURROGATES = frozenset(m.name for m in _SURROGATES)
+"""Models with the dimensions of Euro NCAP's test devices; imports choose them for no other body."""
+
 MODELS: dict[str, Model] = {
     m.name: m
     for m in (
@@ -49,6 +61,7 @@ MODELS: dict[str, Model] = {
         Model("vending_machine", AgentKind.PROP, 1.00, 0.90, 1.90),
         Model("barrier", AgentKind.PROP, 1.50, 0.50, 1.00),
         Model("cone", AgentKind.PROP, 0.40, 0.40, 0.75),
+        *_SURROGATES,
     )
 }
 

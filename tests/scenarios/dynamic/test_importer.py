@@ -366,6 +366,25 @@ def test_leaderboard_scenarios_that_need_an_actor_and_routes_without_a_number(tm
         import_routes(tmp_path)
 
 
+def test_routes_of_leaderboard_2_without_scenarios_are_free_drives(tmp_path: Path) -> None:
+    text = (
+        '<routes><route id="7" town="T"><weathers/><waypoints><position x="0" y="10" z="0"/>'
+        '<position x="50" y="10" z="0"/><position x="50" y="40" z="0"/></waypoints><scenarios>{}</scenarios></route>'
+        "</routes>"
+    )
+    (tmp_path / "b.xml").write_text(text.format(""))
+    (drive,) = import_routes(tmp_path)
+    assert (drive.name, drive.type, drive.town) == ("leaderboard/b_7/FreeDrive", "FreeDrive", "T")
+    quarter = pytest.approx(-math.pi / 2)
+    assert [(pose.x, pose.y, pose.yaw) for pose in drive.route] == [(0, -10, 0), (50, -10, quarter), (50, -40, quarter)]
+    (tmp_path / "b.xml").rename(tmp_path / "meine Straße (2).xml")
+    assert [member.name for member in import_routes(tmp_path)] == ["leaderboard/meine_Stra_e__2__7/FreeDrive"]
+    (tmp_path / "meine Straße (2).xml").unlink()
+    (tmp_path / "b.xml").write_text(text.format('<scenario name="a" type="Accident"/>'))
+    with pytest.raises(FormatError, match=r"b\.xml: route 7: has scenarios of leaderboard 2\.0; .* import leaderboard"):
+        import_routes(tmp_path)
+
+
 @pytest.mark.data
 def test_safebench_has_32_episodes(data_dir: Path, tmp_path: Path) -> None:
     found = import_routes(data_dir / "routes" / "safebench")

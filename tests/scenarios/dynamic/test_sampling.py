@@ -86,6 +86,7 @@ LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_spac
 LATER |= {"all": (), "any": ()}
 LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
 LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
+LATER |= {"elsewhere": "program"}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

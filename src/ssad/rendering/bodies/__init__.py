@@ -31,7 +31,7 @@ class BodyStyle:
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class BodyKind:
     """Maker and styles of a kind of body. `phased` bodies move with a phase (rad)."""
 
     make: Callable[..., Mesh]
@@ -39,8 +39,8 @@ class Body:
     phased: bool = False
 
 
-BODIES: dict[str, Body] = {
-    "car": Body(
+BODIES: dict[str, BodyKind] = {
+    "car": BodyKind(
         _car.car,
         {
             "sedan": BodyStyle((4.75, 1.93, 1.47), 0.035, 3.0),
@@ -51,7 +51,7 @@ BODIES: dict[str, Body] = {
             "pickup": BodyStyle((5.45, 2.07, 1.87), 0.04, 0.7),
         },
     ),
-    "truck": Body(
+    "truck": BodyKind(
         heavy.truck,
         {
             "box": BodyStyle((7.6, 2.52, 3.30), 0.09, 3.0),
@@ -60,7 +60,7 @@ BODIES: dict[str, Body] = {
             "tipper": BodyStyle((7.6, 2.55, 3.15), 0.06, 1.0),
         },
     ),
-    "bus": Body(
+    "bus": BodyKind(
         heavy.bus,
         {
             "city": BodyStyle((11.3, 2.94, 3.40), 0.05, 3.0),
@@ -68,7 +68,7 @@ BODIES: dict[str, Body] = {
             "bendy": BodyStyle((17.8, 2.94, 3.35), 0.02, 0.5),
         },
     ),
-    "trailer": Body(
+    "trailer": BodyKind(
         heavy.trailer,
         {
             "box": BodyStyle((12.6, 2.65, 3.95), 0.06, 3.0),
@@ -77,21 +77,21 @@ BODIES: dict[str, Body] = {
             "utility": BodyStyle((3.6, 1.90, 1.55), 0.10, 0.6),
         },
     ),
-    "construction": Body(
+    "construction": BodyKind(
         machines.construction,
         {
             "excavator": BodyStyle((7.2, 2.80, 3.30), 0.06),
             "wheel_loader": BodyStyle((6.5, 2.60, 3.10), 0.06),
         },
     ),
-    "motorcycle": Body(
+    "motorcycle": BodyKind(
         cycles.motorcycle,
         {
             "ridden": BodyStyle((2.10, 0.80, 1.62), 0.04),
             "parked": BodyStyle((2.08, 0.78, 1.22), 0.04),
         },
     ),
-    "bicycle": Body(
+    "bicycle": BodyKind(
         cycles.bicycle,
         {
             "ridden": BodyStyle((1.73, 0.60, 1.72), 0.03),
@@ -99,7 +99,7 @@ BODIES: dict[str, Body] = {
         },
         phased=True,
     ),
-    "pedestrian": Body(
+    "pedestrian": BodyKind(
         people.pedestrian,
         {
             "adult": BodyStyle((0.76, 0.66, 1.74), 0.05, 6.0),
@@ -111,14 +111,14 @@ BODIES: dict[str, Body] = {
         },
         phased=True,
     ),
-    "stroller": Body(
+    "stroller": BodyKind(
         strollers.stroller,
         {
             "buggy": BodyStyle((0.92, 0.55, 1.02), 0.04, 3.0),
             "pram": BodyStyle((1.00, 0.58, 1.04), 0.04, 1.0),
         },
     ),
-    "traffic_cone": Body(
+    "traffic_cone": BodyKind(
         furniture.traffic_cone,
         {
             "cone": BodyStyle((0.41, 0.41, 0.80), 0.08, 3.0),
@@ -126,7 +126,7 @@ BODIES: dict[str, Body] = {
             "drum": BodyStyle((0.56, 0.56, 1.05), 0.04, 1.0),
         },
     ),
-    "barrier": Body(
+    "barrier": BodyKind(
         furniture.barrier,
         {
             "jersey": BodyStyle((0.60, 2.60, 0.90), 0.06, 2.0),
@@ -135,7 +135,7 @@ BODIES: dict[str, Body] = {
             "water": BodyStyle((0.50, 2.20, 0.95), 0.05),
         },
     ),
-    "traffic_signal": Body(
+    "traffic_signal": BodyKind(
         furniture.traffic_signal,
         {
             "post": BodyStyle((0.55, 0.48, 3.60), 0.02),
@@ -143,14 +143,14 @@ BODIES: dict[str, Body] = {
             "walker": BodyStyle((0.55, 0.48, 3.00), 0.02),
         },
     ),
-    "street_lamp": Body(
+    "street_lamp": BodyKind(
         furniture.street_lamp,
         {
             "curved": BodyStyle((2.20, 0.34, 8.50), 0.06),
             "straight": BodyStyle((1.80, 0.34, 7.50), 0.06),
         },
     ),
-    "sign": Body(
+    "sign": BodyKind(
         furniture.sign,
         {
             "limit": BodyStyle((0.10, 0.66, 2.80), 0.02),
@@ -158,7 +158,7 @@ BODIES: dict[str, Body] = {
             "direction": BodyStyle((0.10, 1.80, 3.60), 0.02),
         },
     ),
-    "stop_sign": Body(
+    "stop_sign": BodyKind(
         furniture.stop_sign,
         {
             "standard": BodyStyle((0.08, 0.76, 2.86), 0.03, 4.0),
@@ -167,14 +167,14 @@ BODIES: dict[str, Body] = {
             "worn": BodyStyle((0.08, 0.70, 2.78), 0.06, 1.5),
         },
     ),
-    "yield_sign": Body(
+    "yield_sign": BodyKind(
         furniture.yield_sign,
         {
             "standard": BodyStyle((0.08, 0.90, 2.90), 0.03, 3.0),
             "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
         },
     ),
-    "debris": Body(
+    "debris": BodyKind(
         anomalies.debris,
         {
             "tyre": BodyStyle((0.68, 0.68, 0.22), 0.05),
@@ -185,7 +185,7 @@ BODIES: dict[str, Body] = {
             "branch": BodyStyle((2.40, 1.20, 0.60), 0.12),
         },
     ),
-    "animal": Body(
+    "animal": BodyKind(
         anomalies.animal,
         {
             "dog": BodyStyle((1.05, 0.26, 0.82), 0.08, 2.0),
@@ -194,7 +194,7 @@ BODIES: dict[str, Body] = {
             "horse": BodyStyle((2.35, 0.56, 2.00), 0.05),
         },
     ),
-    "overturned": Body(
+    "overturned": BodyKind(
         anomalies.overturned_vehicle,
         {
             "car_side": BodyStyle((4.75, 1.47, 1.93), 0.035, 2.0),
@@ -203,7 +203,7 @@ BODIES: dict[str, Body] = {
             "truck_side": BodyStyle((7.60, 3.30, 2.52), 0.06),
         },
     ),
-    "fallen_tree": Body(
+    "fallen_tree": BodyKind(
         anomalies.fallen_tree,
         {
             "leafy": BodyStyle((8.50, 3.80, 2.60), 0.10, 2.0),
@@ -363,7 +363,7 @@ def _in_atlas(mesh: Mesh, atlas: Mapping[str, Rectangle]) -> Mesh:
     return replace(mesh, uv=np.clip(uv, 0.0, 1.0).astype(np.float32), rectangles=targets)
 
 
-def _body(kind: str) -> Body:
+def _body(kind: str) -> BodyKind:
     if kind not in BODIES:
         raise unknown_name("body", kind, BODIES)
     return BODIES[kind]

@@ -22,6 +22,11 @@ ACTOR_BODIES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "bicycle": ("bicycle", ("ridden",)),
     "walker": ("pedestrian", ("adult",)),
     "cone": ("traffic_cone", ("cone",)),
+    "euroncap_adult": ("pedestrian", ("adult",)),
+    "euroncap_child": ("pedestrian", ("child",)),
+    "euroncap_bicycle": ("bicycle", ("ridden",)),
+    "euroncap_motorcycle": ("motorcycle", ("ridden",)),
+    "euroncap_vehicle": ("car", ("hatchback",)),
 }
 # kind of body -> its category in nuScenes; other kinds are no objects of the detection task
 BODY_CATEGORIES: Final[Mapping[str, str]] = {

@@ -3,7 +3,8 @@
 SafeBench and FREA: `scenario_type/*.json` lists episodes (scenario id, route id); routes are in
 `route/scenario_XX_routes/scenario_XX_route_YY.xml`, triggers and actors in
 `route/scenarios/scenario_XX.json`. Leaderboard: XML files of routes beside JSON files of triggers; every
-trigger on a route gives a scenario, a route without triggers a free drive in natural traffic. In a whole checkout of
+trigger on a route gives a scenario, a route without triggers a free drive in natural traffic, also one with the
+positions of leaderboard 2.0. In a whole checkout of
 SafeBench or FREA the two folders lie deeper (`config/scenario_type`, `scenario_data/route`) and are searched. CARLA's
 frame (x forward, y right, yaw clockwise in degrees) is converted here and nowhere else. The town is optional: a
 trigger is matched with the straight lines between key points first, then with the route through the town if it is
@@ -18,7 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,9 +28,12 @@ from ssad.core.import_report import ImportReport
 from ssad.core.safeio import format_location, read_json, read_xml
 from ssad.core.types import EpisodeLimits, Pose, Scenario, SignalPlan
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE, PRECRASH, scenario_type
-from ssad.scenarios.dynamic.schema import problems
+from ssad.scenarios.dynamic.schema import name_part, problems
 from ssad.world.roads import load_town
 from ssad.world.roads.router import route_along
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 NATURAL_ID = 9
 _TYPES: dict[int, str] = {**dict(enumerate(PRECRASH, start=1)), NATURAL_ID: "NaturalJunction"}
@@ -379,7 +383,8 @@ def _leaderboard(folder: Path, report: ImportReport) -> tuple[Scenario, ...]:
             matched.update(index for _, index in triggers)
             if route.has_weather:
                 report.omit("weather of a route", f"{path.name}, route {route.ident}")
-            name, source = f"leaderboard/{path.stem}_{route.ident}", f"leaderboard route {route.ident} of {path.name}"
+            name = f"leaderboard/{name_part(path.stem)}_{route.ident}"
+            source = f"leaderboard route {route.ident} of {path.name}"
             if not triggers:
                 scenarios.append(
                     _check_scenario(free_drive(f"{name}/{FREE_DRIVE}", route.town, route.points, source=source), path)
@@ -429,16 +434,29 @@ def _read_roads(path: Path) -> list[_ImportedRoute]:
         if not town:
             raise FormatError(f"{path}: route {route_id or '?'} names no town")
         location = f"{path}: route {route_id or '?'}"
-        points = tuple(
-            _pose(point.attrib, f"{location}: waypoint {index}") for index, point in enumerate(element.iter("waypoint"))
-        )
-        if len(points) < 2:
-            raise FormatError(f"{location}: needs at least two waypoints, has {len(points)}")
+        if element.find("scenarios/scenario") is not None:
+            raise FormatError(f"{location}: has scenarios of leaderboard 2.0; import the file: ssad import leaderboard")
+        places = element.findall("waypoints/position") or list(element.iter("waypoint"))
+        if len(places) < 2:
+            raise FormatError(f"{location}: needs at least two waypoints, has {len(places)}")
+        points = _with_headings(places, location)
         has_weather = next(element.iter("weather"), None) is not None
         imported_routes.append(_ImportedRoute(route_id or str(len(imported_routes)), town, points, has_weather))
     if not imported_routes:
         raise FormatError(f"{path}: no <route> in it")
     return imported_routes
+
+
+def _with_headings(places: Sequence[Element], location: str) -> tuple[Pose, ...]:
+    """Return the points of a route; those without a heading, as in leaderboard 2.0, look to the next."""
+    points = [
+        _pose({"yaw": "0", **place.attrib}, f"{location}: waypoint {index}") for index, place in enumerate(places)
+    ]
+    for index, place in enumerate(places):
+        if "yaw" not in place.attrib:
+            start, end = points[index : index + 2] if index + 1 < len(points) else points[-2:]
+            points[index] = replace(points[index], yaw=math.atan2(end.y - start.y, end.x - start.x))
+    return tuple(points)
 
 
 def _read_events(path: Path, report: ImportReport | None = None) -> list[_Event]:

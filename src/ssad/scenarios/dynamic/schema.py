@@ -83,6 +83,12 @@ def _adapter() -> TypeAdapter[Scenario]:
     return TypeAdapter(Scenario)
 
 
+def name_part(text: str) -> str:
+    """Return a text, such as the name of a file, as a part of a name: what no name may hold becomes "_"."""
+    part = re.sub(r"[^A-Za-z0-9_.:@+\-]", "_", text)
+    return part if part[:1].isalnum() else f"0{part}"
+
+
 def scenario_from(data: Any, document: Document | None = None, place: Location = ()) -> Scenario:
     """Validate plain data and return the scenario.
 

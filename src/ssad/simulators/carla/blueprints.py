@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from ssad.core.types import AgentKind
-from ssad.world.models import MODELS
+from ssad.world.models import MODELS, SURROGATES
 
 BLUEPRINTS: Final[dict[str, str]] = {
     "car": "vehicle.lincoln.mkz_2017",
@@ -22,9 +22,14 @@ BLUEPRINTS: Final[dict[str, str]] = {
     "vending_machine": "static.prop.vendingmachine",
     "barrier": "static.prop.streetbarrier",
     "cone": "static.prop.trafficcone01",
+    "euroncap_adult": "walker.pedestrian.0001",
+    "euroncap_child": "walker.pedestrian.0009",
+    "euroncap_bicycle": "vehicle.diamondback.century",
+    "euroncap_motorcycle": "vehicle.kawasaki.ninja",
+    "euroncap_vehicle": "vehicle.nissan.micra",
 }
 """Model -> blueprint of CARLA 0.9.16 (its catalogue of vehicles and props)."""
-MODEL_OF: Final[dict[str, str]] = {name: model for model, name in BLUEPRINTS.items()}
+MODEL_OF: Final[dict[str, str]] = {name: model for model, name in BLUEPRINTS.items() if model not in SURROGATES}
 _CATEGORIES: Final[dict[str, tuple[AgentKind, ...]]] = {
     "car": (AgentKind.CAR,),
     "van": (AgentKind.CAR,),
@@ -60,7 +65,9 @@ def nearest_model(category: str, size: Sequence[float]) -> str | None:
         The model of that category whose size differs least; None if the category has none.
     """
     kinds = _CATEGORIES.get(category, ())
-    candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
+    candidates = [
+        candidate for candidate in MODELS.values() if candidate.kind in kinds and candidate.name not in SURROGATES
+    ]
 
     def size_difference(name: str) -> float:
         body = MODELS[name]

@@ -50,6 +50,19 @@ class _Shape:
     s: F64
 
 
+@contextlib.contextmanager
+def _paused_collection() -> Iterator[None]:
+    """Pause the garbage collector, which would visit the millions of objects of a large map again and again."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@_paused_collection()
 def bake(
     map_file: Path,
     name: str | None = None,
@@ -77,8 +90,7 @@ def bake(
     if path.suffix == LANELET2:
         return bake_lanelet2(path, name, options=lanelet2, report=account)
     _refuse_options(path, lanelet2)
-    with _paused_collection():
-        network = read_network(path, account)
+    network = read_network(path, account)
     keys = [
         (road.id, index, lane)
         for road in network.roads.values()
@@ -100,18 +112,6 @@ def bake(
         raise MapError(f"{path}: no drivable lane in it has an area; correct the map and import it again")
     stage("linking lanes, placing signals")
     return _assemble(name or path.stem, network, shapes, sampler, account)
-
-
-@contextlib.contextmanager
-def _paused_collection() -> Iterator[None]:
-    """Pause the garbage collector, which would visit the millions of elements of a large file again and again."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def import_map(
