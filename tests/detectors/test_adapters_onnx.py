@@ -1,6 +1,7 @@
 """Exported detectors: every layout gives the boxes, scores and gradients of the network that was exported."""
 
 import copy
+import io
 import itertools
 import re
 import warnings
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
 from torch import Tensor, nn
 from torchvision.models import detection
 from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBoxGenerator
@@ -22,8 +24,11 @@ from ssad.detectors import make_detector
 from ssad.detectors.adapters.onnx_detector import OnnxOneStage, OnnxYolo, onnx_detector, to_logit
 from ssad.detectors.adapters.torchvision_models import wrap
 from ssad.detectors.check import check_detector, find_faults
-from ssad.experiments.perception.digital.kind import DigitalSuite
+from ssad.engine.kind import Resources
+from ssad.engine.run import run
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
 from ssad.experiments.perception.digital.points import points_of
+from ssad.experiments.runs import write_report
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
@@ -258,6 +263,48 @@ def test_an_export_is_attacked_by_losses_of_its_outputs_and_not_by_a_training_lo
             run_attack(attack, detector, images, true_boxes(), Budget(px(4)), objective=loss)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_default_loss_of_a_suite_rises_with_the_scores_that_it_hides(
+    layout: str, exported: Callable[..., Path]
+) -> None:
+    """`vanish` lowers the scores of objects in every family of outputs, more than noise of the same size does."""
+    detector, images = make_detector(f"onnx:{exported(layout)}"), (pictures(2) * 255).round() / 255
+    score = detector.dense(images).logit.sigmoid()
+    scores = []
+    for name in ("pgd", "noise"):
+        attack = make_attack(name, steps=4) if name == "pgd" else make_attack(name)
+        result = run_attack(attack, detector, images, true_boxes() * 2, Budget(px(8)), objective="vanish")
+        dense = detector.dense(result.images)
+        shown = dense.logit.sigmoid() * (1.0 if dense.quality is None else dense.quality.sigmoid()[..., None])
+        scores.append(float(shown.mean()))
+    dense = detector.dense(images)
+    clean = float((score * (1.0 if dense.quality is None else dense.quality.sigmoid()[..., None])).mean())
+    assert scores[0] < clean
+    assert scores[0] < scores[1]
+
+
+def test_an_export_runs_through_a_digital_suite(exported: Callable[..., Path], tiny_set: Path, tmp_path: Path) -> None:
+    """From the file to the report, with the loss and the audit that a suite chooses by itself."""
+    suite = DigitalSuite(
+        kind="digital",
+        name="mine",
+        detectors=[f"onnx:{exported('yolov8', dynamic=True)}"],
+        data=str(tiny_set),
+        split="all",
+        attacks=["pgd"],
+        sweeps=[],
+        steps=2,
+        replicates=0,
+    )
+    records = run(Digital().plan(suite), tmp_path, Resources(0, console=Console(file=io.StringIO())))
+    assert [(record["status"], record["reason"]) for record in records] == [("ok", "")] * len(records)
+    (attacked,) = (record for record in records if record["attack"] == "pgd")
+    assert attacked["loss"] == "vanish"
+    assert attacked["loss_after"] > attacked["loss_before"]
+    assert attacked["references"]
+    assert "vanish" in write_report(tmp_path).read_text()
+
+
 def test_suites_with_exports_ascend_a_loss_that_they_have() -> None:
     def losses(*detectors: str, **keys: Any) -> set[str]:
         suite = DigitalSuite(kind="digital", name="mine", detectors=list(detectors), **keys)
@@ -385,6 +432,9 @@ def test_torchvision_heads_give_its_boxes_and_losses(kind: str, tmp_path: Path) 
     images.requires_grad_()
     (gradient,) = torch.autograd.grad(detector.dense(images).logit.square().mean(), images)
     assert bool(gradient.flatten(1).any(1).all())
+    clean = (images.detach() * 255).round() / 255
+    result = run_attack(make_attack("pgd", steps=3), detector, clean, truth, Budget(px(4)), objective="vanish")
+    assert bool((result.after > result.before).all()), "the default of suites with exports"
 
 
 def test_torchvision_heads_keep_every_promise(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ from ssad.simulators.carla import simulator as adapter
 from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
 from ssad.simulators.carla.server import WEATHERS, Server
 from ssad.simulators.carla.simulator import Carla
-from ssad.simulators.closed_loop import requested_sensors
+from ssad.simulators.closed_loop import drive, requested_sensors, scenario_json
 from ssad.world.roads import load_town, town_signals
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -98,6 +99,26 @@ def same(episodes: Sequence[Episode], system: str) -> None:
 def test_episodes_go_as_in_the_embedded_world(carla: ModuleType, names: Sequence[str], system: str) -> None:
     same(built([scenario for name in names for scenario in load_scenarios(name)]), system)
     assert carla.CALLS["Client.generate_opendrive_world"] + carla.CALLS["Client.load_world"] == 1  # one town, one load
+
+
+def test_a_driver_of_twenty_decisions_a_second_gets_them(carla: ModuleType) -> None:
+    """The server has steps of 0.05 s for it, and the trace steps of 0.1 s."""
+    times, steps = [], []
+
+    def act(view: Any) -> Any:
+        times.append(float(view.time[0]))
+        steps.append(carla.SERVERS["here", 2000].get_settings().fixed_delta_seconds)
+        return np.zeros((1, 3), np.float32)
+
+    driver = SimpleNamespace(
+        name="often", controller=Controller.EXTERNAL, period=0.05, reset=lambda episodes: None, act=act
+    )
+    scenario = replace(load_scenarios(FEW[0])[0], limits=EpisodeLimits(max_steps=4))
+    spec = {"scenario": scenario_json(scenario), "repetition": 0, "spread": 0.0, "simulator": "carla://here:2000"}
+    _, (trace,), _ = drive([SimpleNamespace(key="a", system="often", seed=0, spec=spec)], device="cpu", driver=driver)
+    assert times == pytest.approx(np.arange(8) / 20)
+    assert set(steps) == {0.05}
+    assert (trace.dt, len(trace.x)) == (0.1, 5)
 
 
 def test_natural_traffic_comes_and_goes(carla: ModuleType) -> None:

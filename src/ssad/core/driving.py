@@ -28,6 +28,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, F64, I32, U8, AgentKind, Bool, Controller, Episode
 
@@ -264,11 +265,11 @@ class Driver(Protocol):
     """Controls an agent ten times a second: the ego, or any other vehicle, cyclist or walker.
 
     A driver with an attribute `target_speed` (m/s) drives at that speed instead of the episode's; one with an
-    attribute `period` (s, a whole fraction of 0.1) is asked that often by `ssad run` in the embedded world; one with an
-    attribute `sensors` (names) gets their readings in `Observation.readings`; one with the methods of `Branching` can
-    be measured by splitting and importance sampling. A minimal class may omit `name` and
-    `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` tests an
-    implementation against this protocol.
+    attribute `period` (s, a whole fraction of 0.1) is asked that often, and refused by simulators with longer steps;
+    one with an attribute `sensors` (names) gets their readings in `Observation.readings`; one with the methods of
+    `Branching` can be measured by splitting and importance sampling. A minimal class may omit `name` and
+    `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` tests an implementation
+    against this protocol.
 
     Attributes:
         name: Name in tables.
@@ -643,3 +644,33 @@ class CommandedSimulator(Protocol):
 
     def advance(self) -> None:
         """Move all agents by their commands."""
+
+
+STEP = 0.1
+"""Seconds between two states of a trace, and between two decisions of a driver without a `period`."""
+
+
+def steps_per_trace_step(driver: Driver) -> int:
+    """Return how often a driver is asked in a step of 0.1 s: once, or by its `period`.
+
+    Raises:
+        ConfigError: Its period does not divide 0.1 s.
+    """
+    period = float(getattr(driver, "period", STEP))
+    count = round(STEP / period) if period > 0.0 else 0
+    if count < 1 or abs(count * period - STEP) > 1e-6:
+        raise ConfigError(f"system {driver.name}: its period is {period:g} s; it must divide {STEP} s, such as 0.05")
+    return count
+
+
+def step_options(count: int) -> dict[str, Any]:
+    """Return the arguments of `World` for `count` steps in each of 0.1 s; none for one."""
+    return {"dt": STEP / count, "substeps": 1} if count > 1 else {}
+
+
+def with_finer_steps(episodes: Sequence[Episode], count: int) -> list[Episode]:
+    """Return episodes for a simulator with `count` steps in each of 0.1 s: their limits of steps are as much larger."""
+    return [
+        replace(episode, limits=replace(episode.limits, max_steps=episode.limits.max_steps * count))
+        for episode in episodes
+    ]

@@ -43,8 +43,10 @@ def merge_steps(trace: EpisodeTrace, count: int) -> EpisodeTrace:
 
     Args:
         trace: The trace.
-        count: Steps that make one.
+        count: Steps that make one; 1 leaves the trace as it is.
     """
+    if count == 1:
+        return trace
     row_count = len(trace.x)
     ends = np.unique([0, *range(count, row_count, count), row_count - 1])
     starts = np.concatenate([[0], ends[:-1] + 1])

@@ -6,9 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from ssad.core.driving import step_options, steps_per_trace_step, with_finer_steps
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import make_folder, write_atomic
+from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, Scenario
 from ssad.interchange.commonroad_writer import STILL, commonroad_text
 from ssad.interchange.openscenario_writer import openscenario_text
@@ -98,7 +100,11 @@ def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    (trace,) = rollout(World([nominal], {nominal.town: graph}), make_system(system))
+    driver = make_system(system)
+    steps_in_one = steps_per_trace_step(driver)
+    finer_episodes = with_finer_steps([nominal], steps_in_one)
+    (fine_trace,) = rollout(World(finer_episodes, {nominal.town: graph}, **step_options(steps_in_one)), driver)
+    trace = merge_steps(fine_trace, steps_in_one)
     return build_episode(freeze_episode(nominal, trace), graph, seed=nominal.seed), True
 
 

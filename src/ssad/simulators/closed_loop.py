@@ -11,7 +11,17 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ssad.core import safeio
-from ssad.core.driving import Driver, LoopChanges, ReadingChange, Sensor, Simulator
+from ssad.core.driving import (
+    STEP,
+    Driver,
+    LoopChanges,
+    ReadingChange,
+    Sensor,
+    Simulator,
+    step_options,
+    steps_per_trace_step,
+    with_finer_steps,
+)
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
@@ -28,7 +38,6 @@ if TYPE_CHECKING:
 
     RequestedSensor = Camera | DepthCamera | SemanticCamera | tuple[str, Lidar]
 
-STEP = 0.1  # s
 WIDTH = 640  # pixels of a picture of nuScenes' rig
 HIGHWAY = "highway-env"  # as a set of scenarios
 EMBEDDED = "embedded"
@@ -251,7 +260,8 @@ def drive(
             agent_driver.to(device)  # type: ignore[attr-defined]
     simulator_name = requests[0].spec.get("simulator", EMBEDDED)
     is_embedded = simulator_name == EMBEDDED and not runs_in_highway_env(requests[0])
-    steps_in_one = steps_per_trace_step(system) if is_embedded else 1
+    steps_in_one = steps_per_trace_step(system) if is_embedded or is_carla(simulator_name) else 1
+    run_episodes, step = with_finer_steps(episodes, steps_in_one), STEP / steps_in_one
     simulator: Simulator
     if is_carla(simulator_name):
         from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
@@ -260,11 +270,11 @@ def drive(
 
         server = Server.of(simulator_name)
         carla_cameras = (
-            sensor_blueprints(requested_sensors([system]), STEP)
+            sensor_blueprints(requested_sensors([system]), step)
             if server.sensors == "carla" and sensors is None
             else {}
         )
-        simulator = Carla(episodes, graphs, server=server, blueprints=carla_cameras)
+        simulator = Carla(run_episodes, graphs, server=server, blueprints=carla_cameras, dt=step)
         if carla_cameras:
             sensors = onboard_sensors(list(policies.values()), device) | {
                 name: CarlaSensor(name) for name in carla_cameras
@@ -272,19 +282,15 @@ def drive(
     elif runs_in_highway_env(requests[0]):
         simulator = HighwayEnv(episodes, graphs)
     elif steps_in_one > 1:
-        finer_episodes = [
-            replace(episode, limits=replace(episode.limits, max_steps=episode.limits.max_steps * steps_in_one))
-            for episode in episodes
-        ]
-        simulator = World(finer_episodes, graphs, device=device, dt=STEP / steps_in_one, substeps=1)
+        simulator = World(run_episodes, graphs, device=device, **step_options(steps_in_one))
     else:
         simulator = make_simulator(simulator_name, episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
-        if steps_in_one > 1:  # traces have steps of 0.1 s, however often a driver is asked
-            traces = [merge_steps(trace, steps_in_one) for trace in traces]
+        # Traces have steps of 0.1 s, however often a driver is asked.
+        traces = [merge_steps(trace, steps_in_one) for trace in traces]
         simulator_metrics = dict(getattr(simulator, "measured", {})) if is_carla(simulator_name) else {}
     finally:
         # External simulators hold a connection, which must end even if a driver raises.
@@ -294,19 +300,6 @@ def drive(
         [replace(trace, key=request.key) for trace, request in zip(traces, requests, strict=True)],
         simulator_metrics,
     )
-
-
-def steps_per_trace_step(driver: Driver) -> int:
-    """Return how often a driver is asked in a step of 0.1 s: once, or by its `period`.
-
-    Raises:
-        ConfigError: Its period does not divide 0.1 s.
-    """
-    period = float(getattr(driver, "period", STEP))
-    count = round(STEP / period) if period > 0.0 else 0
-    if count < 1 or abs(count * period - STEP) > 1e-6:
-        raise ConfigError(f"system {driver.name}: its period is {period:g} s; it must divide {STEP} s, such as 0.05")
-    return count
 
 
 def requested_sensors(drivers: Sequence[Driver]) -> dict[str, RequestedSensor]:

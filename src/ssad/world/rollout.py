@@ -93,6 +93,7 @@ class Loop:
                 raise ConfigError(f"driver {driver.name}: there is no agent {target}; scenes have {simulator.agents}")
             if isinstance(driver, Believer):
                 _check_believer(simulator, target, driver)
+            _check_period(simulator, driver)
             for name in getattr(driver, "sensors", ()):
                 if name not in self.sensors:
                     available = ", ".join(self.sensors)
@@ -362,6 +363,17 @@ def run(loop: Loop) -> None:
         loop.step()
         if (loop.simulator.ended() != End.RUNNING).all():
             break
+
+
+def _check_period(simulator: Simulator, driver: Driver) -> None:
+    """Raise ConfigError if a driver decides more often than a simulator steps: it would drive worse than it can."""
+    period = float(getattr(driver, "period", simulator.dt))
+    if period < simulator.dt - 1e-6:
+        raise ConfigError(
+            f"system {driver.name} decides every {period:g} s, and {type(simulator).__name__} has steps of "
+            f"{simulator.dt:g} s here; drive it in the embedded world or in CARLA "
+            f"(in Python: World(..., dt={period:g}, substeps=1))"
+        )
 
 
 def step_limit(simulator: Simulator) -> int:

@@ -8,10 +8,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ssad.core.driving import Driver
+from ssad.core.driving import Driver, step_options, steps_per_trace_step, with_finer_steps
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
+from ssad.core.traces import merge_steps
 from ssad.core.types import Episode, EpisodeTrace
 from ssad.simulators.closed_loop import onboard_sensors, policies_of, requested_sensors
 from ssad.world.rare.branching import branch_obstacle, refusal
@@ -55,11 +56,16 @@ class ChanceEpisode:
         from ssad.world.world import World
 
         noise = Noise(**self.noise, stretches=9)
-        graphs = {self.episode.town: self.graph}
+        graphs, episodes = {self.episode.town: self.graph}, with_finer_steps([self.episode], self.steps_in_one)
+        options: dict[str, Any] = {"device": self.device, "noise": noise, **step_options(self.steps_in_one)}
         if keys:
-            return ReplayedWorld([self.episode], graphs, keys=keys, means=means, device=self.device, noise=noise)
-        assignment = np.zeros(rows, np.int64)
-        return World([self.episode], graphs, assign=assignment, device=self.device, noise=noise)
+            return ReplayedWorld(episodes, graphs, keys=keys, means=means, **options)
+        return World(episodes, graphs, assign=np.zeros(rows, np.int64), **options)
+
+    @property
+    def steps_in_one(self) -> int:
+        """Steps of the world in one of a trace: a driver is asked as often as its `period` says."""
+        return steps_per_trace_step(self.driver)
 
     def drivers(self) -> list[Driver]:
         """Return the system under test and the drivers that actors of the scenario follow."""
@@ -97,7 +103,7 @@ class ChanceEpisode:
 
         keys = {int(step): int(key) for step, key in crash["keys"].items()}
         (trace,) = rollout(self.world(1, keys, crash["means"]), self.driver, **self._equipment())
-        return trace
+        return merge_steps(trace, self.steps_in_one)
 
     def usual(self, rows: int) -> tuple[float, float]:
         """Return the mean duration of so many episodes, h, and the mean distance of the ego, km."""

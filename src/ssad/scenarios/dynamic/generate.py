@@ -10,11 +10,23 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Choice, Driver, Policies, Selector, Sensor, WorldState
+from ssad.core.driving import (
+    STEP,
+    Choice,
+    Driver,
+    Policies,
+    Selector,
+    Sensor,
+    WorldState,
+    step_options,
+    steps_per_trace_step,
+    with_finer_steps,
+)
 from ssad.core.errors import ConfigError, MissingExtraError, SSADError
 from ssad.core.generators import Base, Generator, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import Reference, check_arguments, names, resolve
+from ssad.core.traces import merge_steps
 from ssad.core.types import AgentKind, Bool, Controller, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.frozen import freeze_episode
@@ -170,7 +182,15 @@ class Trials:
         from ssad.world.rollout import rollout
         from ssad.world.world import World
 
-        world = World(episodes, graphs, device=self.device)
+        ego = self.ego()
+        steps_in_one = steps_per_trace_step(ego)
+        if steps_in_one > 1 and drivers:
+            raise ConfigError(
+                f"system {ego.name} decides every {STEP / steps_in_one:g} s, and learned adversaries every {STEP:g} s: "
+                "they cannot drive side by side; search with another generator, such as random"
+            )
+        finer_episodes = with_finer_steps(episodes, steps_in_one)
+        world = World(finer_episodes, graphs, device=self.device, **step_options(steps_in_one))
         taken_over = np.zeros((world.batch, world.agents), bool)
 
         def recording_selector(selector: Selector) -> Selector:
@@ -182,9 +202,10 @@ class Trials:
 
             return choose
 
-        driver_of: dict[int | Selector, Driver] = {0: self.ego()}
+        driver_of: dict[int | Selector, Driver] = {0: ego}
         driver_of |= {recording_selector(selector): driver for selector, driver in drivers.items()}
-        return rollout(world, driver_of, sensors=self.sensors, policies=self.policies), taken_over
+        traces = rollout(world, driver_of, sensors=self.sensors, policies=self.policies)
+        return [merge_steps(trace, steps_in_one) for trace in traces], taken_over
 
 
 def _adversaries(proposal: Proposal, episode: Episode, trace: EpisodeTrace, taken_over: Bool) -> list[int]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Scenes
+from ssad.core.driving import STEP, Scenes
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import parse_xml
@@ -84,9 +84,10 @@ class Carla(MirroredSimulator):
         server: Server,
         assign: Scenes | None = None,
         blueprints: Mapping[str, SensorBlueprint] | None = None,
+        dt: float = STEP,
     ) -> None:
         check_phases(episodes, "CARLA")
-        self.mirror = World(episodes, graphs, assign=assign)
+        self.mirror = World(episodes, graphs, assign=assign, dt=dt)
         if self.mirror.batch != 1:
             raise ConfigError(f"{server} runs one world: it takes one scene at a time, not {self.mirror.batch}")
         self.dt, self.batch, self.agents = self.mirror.dt, self.mirror.batch, self.mirror.agents

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Believer, Branching, WorldState
+from ssad.core.driving import STEP, Believer, Branching, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, Bool, Controller, End, Episode
@@ -291,11 +291,20 @@ class ReplayedWorld(World):
         means: Sequence[float],
         device: str,
         noise: Noise,
+        dt: float = STEP,
+        substeps: int = 2,
     ) -> None:
         """Take keys by step, and the means of `Process.push` (none: not shifted)."""
         self._keys = keys
         (seed,) = driver_seeds(np.array([keys[0]], np.uint64))
-        super().__init__([replace(episode, seed=seed) for episode in episodes], graphs, device=device, noise=noise)
+        super().__init__(
+            [replace(episode, seed=seed) for episode in episodes],
+            graphs,
+            device=device,
+            noise=noise,
+            dt=dt,
+            substeps=substeps,
+        )
         if means:
             shifts = np.zeros(self.array("noise.push").shape, np.float32)
             shifts[:, used_numbers(self)] = means
