@@ -231,6 +231,20 @@ def test_lane_changes_end_where_and_when_they_are_told() -> None:
     np.testing.assert_allclose(left["overridden"][20:], back[20:], atol=2e-3)
 
 
+def test_walkers_follow_a_path_that_bends() -> None:
+    """They do not steer; on a straight path they go straight on from where they stand."""
+    walker = scripted("w", 0.0, -100.0, model="walker", phases=(Phase(2.0),), route=bend(20.0))
+    aside = scripted(
+        "s", 0.0, -150.5, model="walker", phases=(Phase(2.0),), route=straight_route(Pose(0.0, -150.0), 90.0)
+    )
+    result = drive([episode(ego(), walker, aside, limits=ON)], 120)
+    place = result["pose"][:, 0, 1]
+    np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1] + 80.0), 20.0, atol=0.02)
+    travelled = DT * 2.0 * np.arange(1, 121) - 0.1  # the first step begins at rest
+    np.testing.assert_allclose(place[1:, 2], travelled / 20.0, atol=0.03)
+    np.testing.assert_allclose(result["pose"][-1, 0, 2], [23.9, -150.5, 0.0], atol=0.02)
+
+
 # ---------------------------------------------------------------- triggers
 
 # The ego drives at 10 m/s from x = 10, the lead at 4 m/s from x = 100 (both 4.9 m long): gap 90 - 6 t.

@@ -27,7 +27,7 @@ NOTE: Final = (
 
 def swept_parameters(run: Run) -> list[str]:
     """Return the swept parameters of a run, in the order of its suite; empty: it has no sweep."""
-    names = dict.fromkeys(name for line in run.lines for name in line if name.startswith(SWEEP))
+    names = dict.fromkeys(name for record in run.lines for name in record if name.startswith(SWEEP))
     return [name.removeprefix(SWEEP) for name in names]
 
 
@@ -42,28 +42,31 @@ def run_matrices(run: Run) -> list[Table]:
     """Return the matrices of a run, of the metric and with the rows and columns that its suite names."""
     name = str(run.suite.get("matrix_metric") or "CR")
     titles = {column["name"]: column for column in run.header.get("columns") or []}
-    is_recorded = any(name in (line.get("metrics") or {}) for line in run.lines)
+    is_recorded = any(name in (record.get("metrics") or {}) for record in run.lines)
     metric = METRICS[name].field or name if name in METRICS and not is_recorded else name
     column = titles.get(name) or {}
     unit = f", {column['unit']}" if column.get("unit") else ""
-    title = f"{column.get('title') or name}{unit}"
+    metric_title = f"{column.get('title') or name}{unit}"
     axes = [str(axis) for axis in run.suite.get("matrix") or ()]
-    return matrix_tables(run, metric, title[:1].upper() + title[1:], kind=_kind_of(run.lines, metric), axes=axes)
+    metric_title = metric_title[:1].upper() + metric_title[1:]
+    return matrix_tables(run, metric, metric_title, kind=_kind_of(run.lines, metric), axes=axes)
 
 
-def _kind_of(lines: Sequence[Line], metric: str) -> Kind:
+def _kind_of(records: Sequence[Line], metric: str) -> Kind:
     """Return the kind of the values of a metric: shares are truth values, or 0 and 1 alone."""
-    values = [value for line in lines if (value := (line.get("metrics") or {}).get(metric)) is not None]
+    values = [value for record in records if (value := (record.get("metrics") or {}).get(metric)) is not None]
     return "share" if values and all(value in (0, 1) for value in values) else "mean"
 
 
-def matrix_tables(run: Run, metric: str, title: str, *, kind: Kind = "share", axes: Sequence[str] = ()) -> list[Table]:
+def matrix_tables(
+    run: Run, metric: str, metric_title: str, *, kind: Kind = "share", axes: Sequence[str] = ()
+) -> list[Table]:
     """Return the matrix tables of a run with a sweep.
 
     Args:
         run: The run.
         metric: Metric of the records that the cells show.
-        title: Title of the metric.
+        metric_title: Title of the metric.
         kind: Kind of its values; see `ssad.metrics.uncertainty.estimate`.
         axes: Parameters in the rows and the columns; empty: the first two that have several values.
 
@@ -71,131 +74,135 @@ def matrix_tables(run: Run, metric: str, title: str, *, kind: Kind = "share", ax
         For each system and scenario, a table for each value of the other parameters, or one of the mean over them
         where they have more than `MAX_SLICES` values. With one parameter, systems are the columns. Empty: no sweep.
     """
-    lines = [line for line in run.lines if any(name.startswith(SWEEP) for name in line)]
-    if not lines:
+    records = [record for record in run.lines if any(name.startswith(SWEEP) for name in record)]
+    if not records:
         return []
     parameters = swept_parameters(run)
-    varied = [name for name in parameters if len(_values(lines, name)) > 1] or parameters
+    varied = [name for name in parameters if len(_values(records, name)) > 1] or parameters
     chosen = [name for name in axes if name in parameters]  # a scenario of its own may lack one
     row_name, *column_names = [*chosen, *(name for name in varied if name not in chosen)][:2]
     column_name = column_names[0] if column_names else ""
     others = [name for name in varied if name not in (row_name, column_name)]
-    slices = _slices(lines, others)
-    is_mean = len(slices) > MAX_SLICES
-    has_several_scenarios = len(_groups(lines, "swept")) > 1
+    grid_slices = _slices(records, others)
+    is_mean = len(grid_slices) > MAX_SLICES
+    has_several_scenarios = len(_groups(records, "swept")) > 1
     tables: list[Table] = []
-    for scenario, scenario_lines in _groups(lines, "swept").items():
-        for system, group_lines in (_groups(scenario_lines, "system") if column_name else {"": scenario_lines}).items():
-            for point in [{}] if is_mean else slices:
-                slice_lines = [line for line in group_lines if _is_at(line, point)]
-                if not slice_lines:
+    for scenario_name, scenario_records in _groups(records, "swept").items():
+        systems = _groups(scenario_records, "system") if column_name else {"": scenario_records}
+        for system_name, system_records in systems.items():
+            for point in [{}] if is_mean else grid_slices:
+                slice_records = [record for record in system_records if _is_at(record, point)]
+                if not slice_records:
                     continue
                 point_texts = [f"{name} = {_text(value)}" for name, value in point.items()]
-                subject = ", ".join(filter(None, [system, scenario if has_several_scenarios else "", *point_texts]))
-                rows = _matrix_rows(slice_lines, row_name, column_name, lambda cases: metric_cell(cases, metric, kind))
+                scenario_text = scenario_name if has_several_scenarios else ""
+                subject = ", ".join(filter(None, [system_name, scenario_text, *point_texts]))
+                table_rows = _matrix_rows(
+                    slice_records, row_name, column_name, lambda cases: metric_cell(cases, metric, kind)
+                )
                 tables.append(
                     Table(
                         f"matrix-{len(tables) + 1}" if tables else "matrix",
-                        f"{title}: {subject}" if subject else title,
-                        (BETWEEN.join(_with_unit(lines, name) for name in (row_name, column_name) if name),),
-                        tuple(_text(value) for value in _column_values(slice_lines, column_name)),
-                        rows,
-                        note=f"{_count_note(rows, _mean_note(lines, others) if is_mean else '')} {NOTE}",
+                        f"{metric_title}: {subject}" if subject else metric_title,
+                        (BETWEEN.join(_with_unit(records, name) for name in (row_name, column_name) if name),),
+                        tuple(_text(value) for value in _column_values(slice_records, column_name)),
+                        table_rows,
+                        note=f"{_count_note(table_rows, _mean_note(records, others) if is_mean else '')} {NOTE}",
                     )
                 )
     return tables
 
 
 def _matrix_rows(
-    lines: Sequence[Line], row_name: str, column_name: str, cell_of: Callable[[Sequence[Line]], TableCell]
+    records: Sequence[Line], row_name: str, column_name: str, cell_of: Callable[[Sequence[Line]], TableCell]
 ) -> tuple[TableRow, ...]:
     """Return the rows of a matrix; a point that no line has is empty."""
     members: dict[tuple[Any, Any], list[Line]] = {}
-    for line in lines:
-        column_value = line.get(SWEEP + column_name) if column_name else line.get("system", "")
-        members.setdefault((line.get(SWEEP + row_name), column_value), []).append(line)
+    for record in records:
+        column_value = record.get(SWEEP + column_name) if column_name else record.get("system", "")
+        members.setdefault((record.get(SWEEP + row_name), column_value), []).append(record)
     return tuple(
         TableRow(
             (_text(row_value),),
             tuple(
                 cell_of(members[row_value, column_value]) if (row_value, column_value) in members else EMPTY
-                for column_value in _column_values(lines, column_name)
+                for column_value in _column_values(records, column_name)
             ),
         )
-        for row_value in _values(lines, row_name)
+        for row_value in _values(records, row_name)
     )
 
 
-def _column_values(lines: Sequence[Line], column_name: str) -> list[Any]:
+def _column_values(records: Sequence[Line], column_name: str) -> list[Any]:
     """Return the values of the parameter in the columns; the systems without one."""
-    return _values(lines, column_name) if column_name else list(_groups(lines, "system"))
+    return _values(records, column_name) if column_name else list(_groups(records, "system"))
 
 
 def _point_table(run: Run) -> Table:
     """Return the table of all points of a sweep and all metrics, a row a point, for further computation."""
     metrics = dict.fromkeys(
         metric
-        for line in run.lines
-        for metric, value in (line.get("metrics") or {}).items()
+        for record in run.lines
+        for metric, value in (record.get("metrics") or {}).items()
         if value is None or _is_number(value)
     )
     return Table.pivot(
         "sweep",
         "Points of the sweep",
-        [line for line in run.lines if "swept" in line],
+        [record for record in run.lines if "swept" in record],
         rows={
-            "System": lambda line: line.get("system", ""),
-            "Scenario": lambda line: line["swept"],
+            "System": lambda record: record.get("system", ""),
+            "Scenario": lambda record: record["swept"],
             **{name: _parameter_factor(name) for name in swept_parameters(run)},
         },
         columns={name: name for name in metrics},
-        metric=lambda lines, name: metric_cell(lines, name, _kind_of(run.lines, name)),
+        metric=lambda records, name: metric_cell(records, name, _kind_of(run.lines, name)),
         note=NOTE,
     )
 
 
 def _parameter_factor(name: str) -> Any:
-    return lambda line: _text(line[SWEEP + name]) if SWEEP + name in line else ""
+    return lambda record: _text(record[SWEEP + name]) if SWEEP + name in record else ""
 
 
-def _count_note(rows: Iterable[TableRow], mean_note: str) -> str:
+def _count_note(table_rows: Iterable[TableRow], mean_note: str) -> str:
     """Return in sentences how many cases are behind the numbers of a matrix."""
-    filled = [cell for row in rows for cell in row.cells if cell.n or cell.failed]
+    filled = [table_cell for row in table_rows for table_cell in row.cells if table_cell.n or table_cell.failed]
     if not filled:
         return "No drive of these points ran."
-    fewest, most = min(cell.n for cell in filled), max(cell.n for cell in filled)
-    clusters = max(cell.clusters for cell in filled)
+    fewest, most = min(table_cell.n for table_cell in filled), max(table_cell.n for table_cell in filled)
+    clusters = max(table_cell.clusters for table_cell in filled)
     count = str(fewest) if fewest == most else f"{fewest} to {most}"
     cluster_text = f" in {clusters} cluster{'s' if clusters > 1 else ''}" if most > 1 else ""
     noun = "drive" if most == 1 else "drives"
     return f"{mean_note or 'Each number is of one point of the grid.'} n = {count} {noun} behind it{cluster_text}."
 
 
-def _mean_note(lines: Sequence[Line], others: Sequence[str]) -> str:
-    listed = ", ".join(f"{name} ({len(_values(lines, name))} values)" for name in others)
+def _mean_note(records: Sequence[Line], others: Sequence[str]) -> str:
+    listed = ", ".join(f"{name} ({len(_values(records, name))} values)" for name in others)
     return f"Each number is the mean over {listed}."
 
 
-def _slices(lines: Sequence[Line], names: Sequence[str]) -> list[dict[str, float]]:
+def _slices(records: Sequence[Line], names: Sequence[str]) -> list[dict[str, float]]:
     """Return the combinations of values of parameters that occur, in the order of their first occurrence."""
-    points = dict.fromkeys(tuple(line.get(SWEEP + name, math.nan) for name in names) for line in lines)
+    points = dict.fromkeys(tuple(record.get(SWEEP + name, math.nan) for name in names) for record in records)
     return [dict(zip(names, point, strict=True)) for point in points]
 
 
-def _is_at(line: Line, point: Mapping[str, float]) -> bool:
-    return all(line.get(SWEEP + name) == value for name, value in point.items())
+def _is_at(record: Line, point: Mapping[str, float]) -> bool:
+    return all(record.get(SWEEP + name) == value for name, value in point.items())
 
 
-def _groups(lines: Sequence[Line], field_name: str) -> dict[str, list[Line]]:
+def _groups(records: Sequence[Line], field_name: str) -> dict[str, list[Line]]:
     groups: dict[str, list[Line]] = {}
-    for line in lines:
-        groups.setdefault(str(line.get(field_name, "")), []).append(line)
+    for record in records:
+        groups.setdefault(str(record.get(field_name, "")), []).append(record)
     return groups
 
 
-def _values(lines: Sequence[Line], parameter: str) -> list[float]:
+def _values(records: Sequence[Line], parameter: str) -> list[float]:
     """Return the values of a swept parameter, in ascending order."""
-    return sorted({value for line in lines if _is_number(value := line.get(SWEEP + parameter))})
+    return sorted({value for record in records if _is_number(value := record.get(SWEEP + parameter))})
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
@@ -206,10 +213,10 @@ def _text(value: Any) -> str:
     return f"{value:.12g}" if _is_number(value) else str(value)
 
 
-def _with_unit(lines: Sequence[Line], parameter: str) -> str:
+def _with_unit(records: Sequence[Line], parameter: str) -> str:
     """Return the name of a parameter with the unit that its scenario declares."""
-    scenario = (lines[0].get("spec") or {}).get("scenario") or {}
-    declaration = (scenario.get("parameters") or {}).get(parameter)
+    scenario_name = (records[0].get("spec") or {}).get("scenario") or {}
+    declaration = (scenario_name.get("parameters") or {}).get(parameter)
     unit = declaration.get("unit", "") if isinstance(declaration, Mapping) else ""
     return f"{parameter}, {unit}" if unit else parameter
 
@@ -221,12 +228,15 @@ def terminal_matrices(run: Run) -> list[TerminalTable]:
     matrices = []
     for table in tables:
         row_head, _, column_head = table.heads[0].partition(BETWEEN)
-        rows = (TerminalRow((*row.head, *(matrix_text(cell, table) for cell in row.cells))) for row in table.rows)
+        table_rows = (
+            TerminalRow((*row.head, *(matrix_text(table_cell, table) for table_cell in row.cells)))
+            for row in table.rows
+        )
         matrices.append(
             TerminalTable(
                 f"{table.title} (columns: {column_head})" if column_head else table.title,
                 (row_head, *table.columns),
-                tuple(rows),
+                tuple(table_rows),
                 head_count=1,
                 note="\n".join(notes) if table is tables[-1] else "",
             )
@@ -234,18 +244,18 @@ def terminal_matrices(run: Run) -> list[TerminalTable]:
     return matrices
 
 
-def matrix_text(cell: TableCell, table: Table) -> str:
+def matrix_text(table_cell: TableCell, table: Table) -> str:
     """Return the text of a cell of a matrix: empty where nothing ran, 0 or 1 where all cells are one of them."""
     means = [other.mean for row in table.rows for other in row.cells if not math.isnan(other.mean)]
-    if math.isnan(cell.mean):
+    if math.isnan(table_cell.mean):
         return ""
-    return f"{cell.mean:.0f}" if all(mean in (0.0, 1.0) for mean in means) else cell.text
+    return f"{table_cell.mean:.0f}" if all(mean in (0.0, 1.0) for mean in means) else table_cell.text
 
 
-def shade(cell: TableCell, table: Table) -> str:
+def shade(table_cell: TableCell, table: Table) -> str:
     """Return the background of a cell of a matrix, as a CSS colour mix: from 0 to 1, or to the largest number."""
     largest = max((c.mean for row in table.rows for c in row.cells if not math.isnan(c.mean)), default=1.0)
-    value = cell.mean if not (cell.failed and not math.isnan(cell.high)) else cell.high
+    value = table_cell.mean if not (table_cell.failed and not math.isnan(table_cell.high)) else table_cell.high
     if math.isnan(value):
         return ""
     return f"--bad:{100 * min(max(value / max(largest, 1.0), 0.0), 1.0):.0f}%"

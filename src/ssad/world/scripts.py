@@ -11,18 +11,28 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.triggers import EGO, PAIRS, PHASE_KINDS, all_phases, default_rule, reference_of, trigger_groups
-from ssad.core.types import Controller, Episode, EpisodeAgent, LateralPhase, Phase, PhaseTrigger, Pose, Route
-from ssad.world.kernels.data import Edge, PhaseCondition, Scripts, SpeedProfile, SpeedShape, array_types
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, LateralPhase, Phase, PhaseTrigger, Pose, Route
+from ssad.world.kernels.data import Edge, PhaseCondition, ScriptMotion, Scripts, SpeedProfile, SpeedShape, array_types
+from ssad.world.models import MODELS
 
+BEND = 0.01  # rad by which the heading of a route that bends changes
 LATERAL_TIME = 3.0  # s of a lateral phase that says nothing else
 MAX_OFF_PATH = 5.0  # m that a meeting point may be off the path of its agent
 WORD = 32  # bits of a word of a condition's history
 _MEASURES = ("straight", "road", "lateral")
 
 
-def is_scripted(agent: EpisodeAgent) -> bool:
-    """Return whether the world keeps a script for an agent."""
-    return bool(agent.phases or agent.lateral) or (agent.controller == Controller.SCRIPT and agent.speed > 0.0)
+def script_motion(agent: EpisodeAgent) -> ScriptMotion:
+    """Return the way in which the world moves an agent by its script.
+
+    Agents with lateral phases move exactly along their route, and so do walkers on a route that bends: they do not
+    steer.
+    """
+    if not (agent.phases or agent.lateral or (agent.controller == Controller.SCRIPT and agent.speed > 0.0)):
+        return ScriptMotion.NONE
+    is_walker = agent.model in MODELS and MODELS[agent.model].kind == AgentKind.WALKER
+    bends = agent.route is not None and len(agent.route.xy) > 1 and float(np.ptp(np.unwrap(agent.route.yaw))) > BEND
+    return ScriptMotion.RAIL if agent.lateral or (is_walker and bends) else ScriptMotion.STEERED
 
 
 class ScriptTables:
@@ -52,7 +62,7 @@ class ScriptTables:
         phase_rows: dict[tuple[int, str], int] = {}
         row = 0
         for index, agent in enumerate(episode.agents):
-            agent_rows[index] = row, len(agent.phases), len(agent.lateral), is_scripted(agent)
+            agent_rows[index] = row, len(agent.phases), len(agent.lateral), script_motion(agent)
             for phase in all_phases(agent):
                 if phase.name:
                     phase_rows[index, phase.name] = row

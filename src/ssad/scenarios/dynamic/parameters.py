@@ -24,6 +24,7 @@ TARGET_SPEED: Final = "target_speed"
 MAX_GRID: Final = 100_000
 """Most values of a grid, and most points of a sweep."""
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_NUMBERS: Final = (float, int)
 _NUMBER: Final = re.compile(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*")
 """A number as text, which is refused: quotes around it are a slip."""
 _NO_NUMBERS: Final = ("seed", "declared", "expressions")  # fields of a scenario in which no expression stands
@@ -410,6 +411,8 @@ def insert_expressions(data: dict[str, Any], scenario: Scenario) -> None:
 
 def _collect_texts(data: Any, hint: Any, location: tuple[str | int, ...], texts: dict[Location, str]) -> None:
     """Collect the texts that stand where a type expects a number, by their locations."""
+    if isinstance(data, _NUMBERS):  # fast path: most leaves are numbers
+        return
     hint = _without_none(hint)
     if hint in (float, int):
         if isinstance(data, str) and not _NUMBER.fullmatch(data):
@@ -421,7 +424,7 @@ def _collect_texts(data: Any, hint: Any, location: tuple[str | int, ...], texts:
                     _collect_texts(value, _hints(hint)[key], (*location, key), texts)
     elif typing.get_origin(hint) is tuple:
         if isinstance(data, list | tuple):
-            if all(type(value) in (float, int) for value in data):  # fast path: rows of trajectories
+            if all(type(value) in _NUMBERS for value in data):  # fast path: rows of trajectories
                 return
             for index, value in enumerate(data):
                 _collect_texts(value, _item_hint(hint, index), (*location, index), texts)
@@ -447,6 +450,7 @@ def _hints(dataclass_type: Any) -> dict[str, Any]:
     return typing.get_type_hints(dataclass_type)
 
 
+@cache
 def _without_none(hint: Any) -> Any:
     """Return the type of an optional value; None for a union of several."""
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
@@ -513,6 +517,20 @@ def _with_item(data: Any, steps: Location, new_value: Any) -> Any:
 def parameter_problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """Yield the problems of the parameters of a scenario: location among its keys, and a message."""
     box = scenario_type(scenario.type).box
+    if scenario.declared or scenario.expressions:
+        yield from _declared_problems(scenario, box)
+    for name, value in scenario.parameters.items():
+        if name not in box:
+            hint = f"; to declare one, write {name}: {{value: {value:g}}}" if scenario.type == CUSTOM else ""
+            yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box)}{hint}"
+        elif problem := box[name].problem(value):
+            key = ("value",) if name in scenario.declared else ()
+            yield ("parameters", name, *key), problem
+    if violation := violated_constraint(scenario):
+        yield ("constraints", violation[0]), violation[1]
+
+
+def _declared_problems(scenario: Scenario, box: Mapping[str, Parameter]) -> Iterator[tuple[tuple[str | int, ...], str]]:
     for name, declaration in scenario.declared.items():
         yield from ((("parameters", name, *key), text) for key, text in _declaration_problems(name, declaration, box))
     try:
@@ -525,15 +543,6 @@ def parameter_problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ..
         if not low <= values[name] <= high:
             unit = f" {declaration.unit}" if declaration.unit else ""
             yield ("parameters", name, "value"), f"{values[name]:g} is outside its range, {low:g} to {high:g}{unit}"
-    for name, value in scenario.parameters.items():
-        if name not in box:
-            hint = f"; to declare one, write {name}: {{value: {value:g}}}" if scenario.type == CUSTOM else ""
-            yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box)}{hint}"
-        elif problem := box[name].problem(value):
-            key = ("value",) if name in scenario.declared else ()
-            yield ("parameters", name, *key), problem
-    if violation := violated_constraint(scenario):
-        yield ("constraints", violation[0]), violation[1]
 
 
 def _name_problem(name: str) -> str:

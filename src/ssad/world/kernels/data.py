@@ -87,6 +87,14 @@ class SpeedProfile(IntEnum):
     ARRIVAL = 5
 
 
+class ScriptMotion(IntEnum):
+    """Way in which a script moves its agent: not at all, by steering, or exactly along its route."""
+
+    NONE = 0
+    STEERED = 1
+    RAIL = 2
+
+
 class Presence(IntEnum):
     """Presence of an agent; it sleeps until the ego comes near."""
 
@@ -122,7 +130,7 @@ class EpisodeArrays:
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
-    script: wp.array2d(dtype=wp.vec4i)  # [E, A] first phase of the episode's, phases, lateral phases, 1 if scripted
+    script: wp.array2d(dtype=wp.vec4i)  # [E, A] first phase of the episode's, phases, lateral phases, ScriptMotion
     town: wp.array(dtype=wp.int32)  # [E]
     signal: wp.array2d(dtype=wp.int32)  # [E, S] forced SignalState, -1 none
     limits: wp.array(dtype=wp.vec4)  # [E] max steps, max time s, max distance m, override until s
@@ -230,7 +238,7 @@ class ScriptState:
     # [B, A] of the lateral phase: m left of the route at its start, place there m along the route, duration s or
     # length m, 1 if it is a length
     swerve: wp.array2d(dtype=wp.vec4)
-    rail: wp.array2d(dtype=wp.vec2)  # [B, A] place m along the route and m left of it; only of agents that may swerve
+    rail: wp.array2d(dtype=wp.vec2)  # [B, A] place m along the route and m left of it; only of agents on a rail
     goal: wp.array2d(dtype=wp.vec4)  # [B, A] x, y, yaw and speed at the end of the step; the pose only of the same
 
 

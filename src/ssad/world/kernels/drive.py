@@ -15,6 +15,7 @@ from ssad.world.kernels.data import (
     PerceivedAgents,
     Presence,
     Roads,
+    ScriptMotion,
     State,
 )
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
@@ -125,7 +126,7 @@ def drive_one(
     if controller == Controller.NONE:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
     elif controller == Controller.SCRIPT:
-        if bank.script[e, i][3] == 0:  # `run_scripts` drives the others
+        if bank.script[e, i][3] == ScriptMotion.NONE:  # `run_scripts` drives the others
             state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
     elif controller == Controller.AUTOPILOT or controller == Controller.FOLLOW:
         steer = float(0.0)

@@ -3,7 +3,16 @@
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, ScriptState, State
+from ssad.world.kernels.data import (
+    REGISTERS_OF_MOTION,
+    End,
+    EpisodeArrays,
+    Presence,
+    Roads,
+    ScriptMotion,
+    ScriptState,
+    State,
+)
 from ssad.world.kernels.shared import lane_under, on_track, row, sign_line, track_at, wrap
 from ssad.world.models import REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
@@ -127,10 +136,10 @@ def move_one(
     is_placed = controller == Controller.PLACED or controller == Controller.TRAJECTORY
     if controller == Controller.SCRIPT:
         rows = bank.script[e, i]
-        if rows[3] == 1 and state.active[b, i] == Presence.AWAKE:
+        if rows[3] != ScriptMotion.NONE and state.active[b, i] == Presence.AWAKE:
             is_scripted = 1
             target_place = script.goal[b, i]
-            is_placed = rows[2] > 0
+            is_placed = rows[3] == ScriptMotion.RAIL
     if is_placed:
         if controller == Controller.PLACED:
             target_place = place[b, i]

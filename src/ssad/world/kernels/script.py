@@ -16,6 +16,7 @@ from ssad.world.kernels.data import (
     PhaseCondition,
     Presence,
     Roads,
+    ScriptMotion,
     Scripts,
     ScriptState,
     SpeedProfile,
@@ -568,7 +569,7 @@ def begin_all(
         if scripts.ring[condition][1] > 0 or scripts.condition[condition][0] == PhaseCondition.STANDSTILL:
             remember(bank, roads, scripts, state, script, scene, condition, dt)
     for agent in range(agents):
-        if bank.script[episode, agent][3] == 1 and state.active[scene, agent] == Presence.AWAKE:
+        if bank.script[episode, agent][3] != ScriptMotion.NONE and state.active[scene, agent] == Presence.AWAKE:
             if begin_phases(bank, roads, scripts, state, script, scene, agent, dt) == 1:
                 begins = 1
     return begins
@@ -863,7 +864,7 @@ def run_one(
     """Decide the motion of a scripted agent in this step."""
     episode = state.episode[scene]
     controller = state.controller[scene, agent]
-    if controller != Controller.SCRIPT and bank.script[episode, agent][2] > 0:
+    if controller != Controller.SCRIPT and bank.script[episode, agent][3] == ScriptMotion.RAIL:
         # another driver has it now; the script would go on from where that one leaves it
         script.rail[scene, agent] = rail_under(bank, roads, state, scene, agent)
     if controller == Controller.FOLLOW:
@@ -877,7 +878,7 @@ def run_one(
         current = state.speed[scene, agent]
         pose = wp.vec3(0.0, 0.0, 0.0)
         steer = float(0.0)
-        if bank.script[episode, agent][2] > 0:
+        if bank.script[episode, agent][3] == ScriptMotion.RAIL:
             pose = advance_on_rail(bank, roads, scripts, state, script, scene, agent, speed, dt)
         elif bank.route[episode, agent][1] > 1:
             steer = steer_on_route(bank, roads, state, scene, agent, episode, current)
@@ -915,7 +916,7 @@ def run_scripts(
         while begins == 1:
             begins = begin_all(bank, roads, scripts, state, script, scene, agents, dt)
     for agent in range(agents):
-        if bank.script[episode, agent][3] == 1 and state.active[scene, agent] == Presence.AWAKE:
+        if bank.script[episode, agent][3] != ScriptMotion.NONE and state.active[scene, agent] == Presence.AWAKE:
             run_one(bank, roads, scripts, state, script, scene, agent, dt)
 
 
@@ -952,7 +953,7 @@ def restart_scripts(
         script.goal[scene, agent] = wp.vec4(0.0, 0.0, 0.0, 0.0)
         rail = wp.vec2(0.0, 0.0)
         route = bank.route[episode, agent]
-        if bank.script[episode, agent][2] > 0 and route[1] > 1:
+        if bank.script[episode, agent][3] == ScriptMotion.RAIL and route[1] > 1:
             start = bank.start[episode, agent]
             nearest = int(0)
             min_distance2 = float(1.0e12)
