@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import itertools
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +25,7 @@ from ssad.core.traces import load_trace
 from ssad.drivers import make_system
 from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
+from ssad.experiments.adversarial.found_collisions import has_proof, ranked_collisions
 from ssad.experiments.adversarial.kind import Adversarial
 from ssad.experiments.adversarial.search_scores import distinct_collisions, summary
 from ssad.experiments.runs import write_report
@@ -75,6 +77,57 @@ def test_a_record_says_what_was_found_and_how_often_not() -> None:
     assert nothing["CR_any"]
     assert nothing["rollouts"] is None
     assert nothing["impact_speed"] is None
+
+
+AVOIDED = {"avoided_by_cc": 0.0, "avoided_by_reg157": 1.0, "avoided_by_rss": 0.0, "avoided_by_fsm": 0.0}
+
+
+def replay(*, end: str = "collision", yaw: float = 0.0, ego_speed: float = 8.0) -> Any:
+    """A saved collision, driven again: the ego reaches a car that goes 3 m/s, on the road's own lane by default."""
+    graph = load_town("ProvingGround")
+    lane = int(np.flatnonzero((graph.kind == 1) & (graph.junction < 0) & (graph.length > 80))[0])
+    x, y, heading, _ = graph.at(lane, 10.0)
+    cos, sin = np.cos(heading), np.sin(heading)
+    along, ahead = ego_speed * STEP, 20.0 + 3.0 * STEP * np.cos(yaw)
+    contact = (np.arange(31) == 30).astype(np.uint8)
+    trace = make_trace(
+        31,
+        [
+            (x + along * cos, y + along * sin, heading, ego_speed),
+            (x + ahead * cos, y + ahead * sin, heading + yaw, 3.0),
+        ],
+        contact=contact,
+        contact_agent=np.where(contact, 1, -1).astype(np.int32),
+        end=end,
+    )
+    return SimpleNamespace(scenario=SCENARIO, graph=graph, trace=trace)
+
+
+def test_a_base_has_a_proof_if_a_saved_collision_meets_every_condition_again() -> None:
+    unavoided = dict.fromkeys(AVOIDED, 0.0) | {"avoided_by_limit": 1.0}
+    name = [("agent1",)]
+    assert has_proof([replay()], name, [AVOIDED]) is True
+    assert has_proof([replay()], name, [unavoided]) is False  # a manoeuvre with knowledge of the future is no driver
+    assert has_proof([replay()], name, None) is None
+    assert has_proof([replay()], [("agent2",)], [AVOIDED]) is False
+    assert has_proof([replay(yaw=math.pi)], name, [AVOIDED]) is False
+    assert has_proof([replay(yaw=math.pi, ego_speed=0.0)], name, None) is False  # no grade can prove it
+    assert has_proof([replay(ego_speed=0.0)], name, [AVOIDED]) is False
+    assert has_proof([replay(end="complete"), replay()], name * 2, [AVOIDED]) is True  # grades are of collisions alone
+    assert has_proof([replay(end="complete")], name, []) is False
+    assert has_proof([replay(), replay()], name * 2, [unavoided, AVOIDED]) is True
+
+
+def test_collisions_that_may_be_proven_are_saved_first() -> None:
+    base: Any = SimpleNamespace(graph=load_town("ProvingGround"))
+
+    def outcome(drive: Any) -> Outcome:
+        proposal = Proposal(SCENARIO)
+        return Outcome(proposal, trace=drive.trace, adversaries=(1,), collision=True, time=3.0, gap=0.0)
+
+    standing, moving = outcome(replay(ego_speed=0.0)), outcome(replay())
+    assert ranked_collisions([standing, moving], base) == [moving, standing]
+    assert ranked_collisions([dataclasses.replace(moving, off_road=True), standing], base) == [standing]
 
 
 def test_generators_and_systems_meet_the_same_bases_with_the_same_seeds() -> None:
@@ -147,6 +200,8 @@ def test_the_ranges_of_a_scenario_with_actors_of_its_own_are_searched(
     plan = Adversarial().plan(load_suite("adversarial-quick", [*settings, f"scenarios={tmp_path / 'mine.yaml'}"]))
     (line,) = Adversarial().execute([plan.cells[0]], Job(tmp_path, "cpu", {})).values()
     assert (line["metrics"]["applies"], line["n"]) == (True, 12)
+    # Nothing is saved, so a collision can be neither proven nor not.
+    assert line["metrics"]["proven"] == (None if line["metrics"]["CR"] else False)
     points = {
         (actor.phases[0].speed or 0.0, actor.phases[0].when.value)
         for outcome in outcomes
@@ -199,6 +254,8 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert metrics["attributable"] == max(careful)
     assert metrics["avoided_by_limit"] >= metrics["attributable"]
     assert ("attributable_moving" in metrics) == (metrics["moving"] > 0.0)
+    assert metrics["proven"] in (True, False)
+    assert metrics["proven"] <= metrics.get("attributable_moving", 0.0)
     assert set(line["transfer"]) == {"blind"}
     assert line["transfer"]["blind"]["base"] == 1.0  # the blind follower does not survive the base either
     (saved,) = read_scenarios(tmp_path / line["artefacts"]["scenarios"])

@@ -22,6 +22,7 @@ from ssad.experiments.adversarial.page import (
     traffic_table,
     transfer_table,
 )
+from ssad.experiments.adversarial.verdict import verdict
 from ssad.report.load import Run
 from ssad.world.roads import load_town
 
@@ -85,15 +86,57 @@ def test_generators_are_compared_with_random_search_base_by_base(found: Run) -> 
     assert table is not None
     (row,) = table.rows
     assert row.head == ("king", "autopilot")
-    assert row.cells[0].mean == pytest.approx(0.9)
-    assert row.cells[0].failed == 0
-    assert row.cells[0].n == 10
+    proven, collides = row.cells
+    assert proven.text == "n/a"
+    assert collides.mean == pytest.approx(0.9)
+    assert collides.failed == 0
+    assert collides.n == 10
+    for one in found.lines:
+        if one["metrics"]["survived"]:
+            one["metrics"]["proven"] = one["key"] == "king3"
+    measured = against_table(found)
+    assert measured is not None
+    assert cell(measured, 0, "difference of proven").mean == pytest.approx(0.1)
     assert against_table(run([line("king", 0, 1)])) is None
+
+
+def test_the_headline_is_the_share_of_proven_collisions_with_the_raw_rate_beside_it(found: Run) -> None:
+    assert [c.text for c in column(summary(found), "proven")] == ["n/a", "n/a"]
+    assert group_table(found, "proven") is None
+    for one in found.lines:
+        if one["metrics"]["survived"]:
+            number = int(one["key"].removeprefix(one["generator"]))
+            one["metrics"] |= {
+                "proven": one["generator"] == "king" and number < 3,
+                "CR_any": one["generator"] == "king",
+            }
+    table = summary(found)
+    assert table.columns[1:3] == ("proven", "raw CR")
+    king, random = column(table, "proven")
+    assert (king.mean, king.n, random.mean) == (pytest.approx(0.3), 10, 0.0)
+    assert king.low < 0.3 < king.high
+    assert [c.mean for c in column(table, "raw CR")] == [1.0, 0.0]
+    groups = group_table(found, "proven")
+    assert groups is not None
+    assert cell(groups, 0, "A").mean == pytest.approx(3 / 6)
+    assert cell(groups, 0, "B").mean == 0.0
+    header = {**found.header, "columns": [c for c in found.header["columns"] if c["name"] != "proven"]}
+    earlier = Run(found.folder, header, found.lines, {}, len(found.lines))
+    assert [c.text for c in column(summary(earlier), "proven")] == ["n/a", "n/a"]
+    assert column(summary(earlier), "raw CR")[0].mean == 1.0
+    (proven, rate) = verdict(found)
+    assert "king in 3 of 10" in proven
+    assert "king in 10 of 10" in rate
+
+
+def column(table: Any, name: str) -> list[Any]:
+    return [row.cells[table.columns.index(name)] for row in table.rows]
 
 
 def test_groups_have_their_own_rates_and_failures_count(found: Run) -> None:
     lines = [*found.lines, line("king", 11, None, status="failed", reason="no road", metrics={})]
     table = group_table(run(lines))
+    assert table is not None
     assert table.columns == ("A", "B")
     assert cell(table, 0, "A").mean == pytest.approx(1.0)
     assert cell(table, 0, "B").failed == 1

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.core.types import Episode, Scenario
-from ssad.experiments.adversarial.search_scores import MOVING, distinct_collisions
+from ssad.experiments.adversarial.search_scores import distinct_collisions
+from ssad.metrics.proven_collisions import MOVING
+
+if TYPE_CHECKING:
+    from ssad.scenarios.dynamic.generate import Trials
 
 AVOIDERS = {
     "cc": "CC",
@@ -34,6 +38,8 @@ def saved_collisions(
 ) -> tuple[list[Outcome], list[Scenario]]:
     """Write the most distinct collisions of a search as scenarios, if there are any.
 
+    Collisions that would be proven if a careful driver avoids them come first.
+
     Args:
         path: The YAML file.
         base: What was searched.
@@ -47,11 +53,87 @@ def saved_collisions(
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
-    collisions = distinct_collisions([outcome for outcome in row if outcome.is_valid])[:limit]
+    collisions = ranked_collisions(row, base)[:limit]
     scenarios = [scenario_of(outcome, base, name=f"{stem}-{index}") for index, outcome in enumerate(collisions)]
     if scenarios:
         save_scenarios(path, scenarios)
     return collisions, scenarios
+
+
+def ranked_collisions(row: Sequence[Outcome], base: Base) -> list[Outcome]:
+    """Return the distinct valid collisions of a search, first those that a careful driver alone keeps from proof."""
+    from ssad.scenarios.dynamic.outcome import is_candidate
+
+    valid = [outcome for outcome in row if outcome.is_valid]
+    return distinct_collisions(sorted(valid, key=lambda outcome: not is_candidate(outcome, base.graph)))
+
+
+def has_proof(
+    replays: Sequence[Base], adversaries: Sequence[Sequence[str]], rows: Sequence[Mapping[str, float]] | None
+) -> bool | None:
+    """Return whether one of some saved collisions is proven, as it was driven again.
+
+    Args:
+        replays: The saved scenarios, driven again.
+        adversaries: Names of the adversaries of each.
+        rows: Who avoids each of the replays that collide; see `ssad.drivers.careful.grade.Grade.metrics`. None: they
+            were not graded.
+
+    Returns:
+        None where only a grade that was not made decides.
+    """
+    from ssad.scenarios.dynamic.outcome import proof_of
+
+    collisions = [(base, names) for base, names in zip(replays, adversaries, strict=True) if has_collision(base)]
+    avoidable = [None] * len(collisions) if rows is None else [is_avoidable(row) for row in rows]
+    proofs = [
+        proof_of(base.scenario, base.trace, base.graph, names, avoidable=value).is_proven
+        for (base, names), value in zip(collisions, avoidable, strict=True)
+    ]
+    return True if any(proofs) else None if None in proofs else False
+
+
+def is_avoidable(row: Mapping[str, float]) -> bool:
+    """Return True if a careful driver avoids a graded collision; the kinematic limit does not count."""
+    return any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit")
+
+
+def proven_bases(bases: Sequence[Base], rows: Sequence[Sequence[Outcome]], trials: Trials, *, limit: int) -> list[bool]:
+    """Return for each base whether its search has found a proven collision.
+
+    Args:
+        bases: The bases.
+        rows: Outcomes of the search in each.
+        trials: Test bench with the driving system of the search.
+        limit: Collisions of each search that are driven again and graded.
+    """
+    from ssad.scenarios.dynamic.generate import scenario_of
+    from ssad.scenarios.dynamic.outcome import adversary_names, is_candidate
+    from ssad.simulators.closed_loop import grades_of
+
+    candidates = [
+        (index, outcome)
+        for index, (base, row) in enumerate(zip(bases, rows, strict=True))
+        for outcome in ranked_collisions(row, base)[:limit]
+        if is_candidate(outcome, base.graph)
+    ]
+    # another seed: a saved collision must not depend on the seed of its search
+    replays = trials.bases(
+        [
+            (scenario_of(outcome, bases[index], name="candidate"), bases[index].graph, bases[index].episode.seed + 1)
+            for index, outcome in candidates
+        ]
+    )
+    driven = [
+        (index, replay, adversary_names(outcome))
+        for (index, outcome), replay in zip(candidates, replays, strict=True)
+        if has_collision(replay)
+    ]
+    grades_of_replays = grades_of([(replay.episode, replay.trace) for _, replay, _ in driven], trials.device)
+    proven = [False] * len(bases)
+    for (index, replay, names), grade in zip(driven, grades_of_replays, strict=True):
+        proven[index] |= bool(has_proof([replay], [names], [grade.metrics()]))
+    return proven
 
 
 def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> dict[str, float]:
@@ -63,10 +145,10 @@ def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> d
     """
     if not rows:
         return {}
-    is_avoidable = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
-    avoidable_moving = [avoidable for avoidable, base in zip(is_avoidable, collisions, strict=True) if _ego_moves(base)]
+    avoidable = [is_avoidable(row) for row in rows]
+    avoidable_moving = [value for value, base in zip(avoidable, collisions, strict=True) if _ego_moves(base)]
     shares_by_model = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    shares_by_model["attributable"] = float(np.mean(is_avoidable))
+    shares_by_model["attributable"] = float(np.mean(avoidable))
     return shares_by_model | ({"attributable_moving": float(np.mean(avoidable_moving))} if avoidable_moving else {})
 
 

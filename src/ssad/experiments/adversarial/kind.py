@@ -26,6 +26,7 @@ from ssad.experiments.adversarial.found_collisions import (
     AVOIDERS,
     grades,
     has_collision,
+    has_proof,
     refusal_reason,
     saved_collisions,
     transfer,
@@ -47,7 +48,7 @@ class AdversarialSuite(ScenarioSuite):
         budget: Rollouts that a generator may spend on a base.
         batch: Rollouts that it proposes at once.
         repetitions: Searches of each, with seeds of their own.
-        keep: Collisions that are saved of each search, the most distinct first.
+        keep: Distinct collisions that are saved of each search; those that may be proven come first.
         grade: Whether to grade which careful drivers avoid each of these (docs/explanation/careful-drivers.md).
         transfer: Systems that the saved scenarios are also driven with.
         chunk: Base scenarios that one generator works on side by side.
@@ -71,16 +72,17 @@ class Adversarial(ScenarioKind):
     name = "adversarial"
     suite = AdversarialSuite
     factors = ("generator", "system", "group")
-    rates: ClassVar[Mapping[str, str]] = {"CR": "CR", "CR_any": "CR_any"}
+    rates: ClassVar[Mapping[str, str]] = {"proven": "proven", "CR_any": "CR_any", "CR": "CR"}
     columns = (
         Column("applies", "generator applies", limits=SHARE),
         Column("survived", "plain replay survived", limits=SHARE),
-        Column("CR", "collision found, adversary on the road and hitting nobody else", "", "higher", limits=SHARE),
-        Column("CR_any", "any collision with the adversary found", "", "higher", limits=SHARE),
+        Column("proven", "proven collision found", "", "higher", limits=SHARE),
+        Column("CR_any", "any collision with the adversary found (raw CR)", "", "higher", limits=SHARE),
+        Column("CR", "collision found, adversary on its side and hitting nobody else", "", "higher", limits=SHARE),
         Column("rollouts", "rollouts to the first", "", "lower", limits=COUNT),
         Column("share", "share of rollouts that collide", "", "higher", limits=SHARE),
         Column("distinct", "distinct collisions", "", "higher", limits=COUNT),
-        Column("off_road", "rollouts with the adversary off the road", "", "lower", limits=SHARE),
+        Column("off_road", "rollouts with the adversary off its side of the road", "", "lower", limits=SHARE),
         Column("hit_others", "rollouts with the adversary in others", "", "lower", limits=SHARE),
         Column("moving", "collisions in which the ego moves", "", "higher", limits=SHARE),
         Column("impact_speed", "impact speed", "m/s", limits=NOT_NEGATIVE),
@@ -207,12 +209,18 @@ class Adversarial(ScenarioKind):
             for cell, base, trial_outcomes in zip(surviving_cells, surviving_bases, outcomes, strict=True)
         ]
         replays = self._drive_again(
-            surviving_cells, surviving_bases, [saved_scenarios for _, saved_scenarios in saved], trials
+            surviving_cells,
+            surviving_bases,
+            [saved_scenarios for _, saved_scenarios, _ in saved],
+            [adversaries for _, _, adversaries in saved],
+            trials,
         )
-        for cell, base, trial_outcomes, (artefacts, _), replay_record in zip(
+        for cell, base, trial_outcomes, (artefacts, _, _), replay_record in zip(
             surviving_cells, surviving_bases, outcomes, saved, replays, strict=True
         ):
             metrics = {"applies": True, "survived": True, **summary(trial_outcomes), **replay_record.pop("metrics")}
+            if not metrics["CR"]:
+                metrics["proven"] = False
             metrics |= realism_scores(trial_outcomes, base.graph, reference_motion)
             # All bases are searched side by side: each takes an equal part of the time.
             metrics["seconds"] = max(time_by_rollouts.values()) / len(surviving_cells)
@@ -233,8 +241,10 @@ class Adversarial(ScenarioKind):
 
     def _save(
         self, cell: Cell, base: Base, row: Sequence[Outcome], folder: Path
-    ) -> tuple[dict[str, Any], list[Scenario]]:
-        """Write the most distinct collisions as scenarios, and the trace of the first."""
+    ) -> tuple[dict[str, Any], list[Scenario], list[tuple[str, ...]]]:
+        """Write the most distinct collisions as scenarios, and the trace of the first; return also who attacked."""
+        from ssad.scenarios.dynamic.outcome import adversary_names
+
         suffix = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
         stem = f"{base.scenario.name}/{cell.fields['generator']}{suffix}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
@@ -242,16 +252,22 @@ class Adversarial(ScenarioKind):
             folder / artefacts["scenarios"], base, row, limit=cell.spec["keep"], stem=stem
         )
         if not collisions:
-            return {}, []
+            return {}, [], []
         assert collisions[0].trace is not None
         save_trace(folder / artefacts["trace"], collisions[0].trace)
-        return {"artefacts": artefacts, "adversaries": list(collisions[0].adversaries)}, saved_scenarios
+        record = {"artefacts": artefacts, "adversaries": list(collisions[0].adversaries)}
+        return record, saved_scenarios, [adversary_names(outcome) for outcome in collisions]
 
     def _drive_again(
-        self, cells: Sequence[Cell], bases: Sequence[Base], scenarios_by_base: Sequence[Sequence[Scenario]], trials: Any
+        self,
+        cells: Sequence[Cell],
+        bases: Sequence[Base],
+        scenarios_by_base: Sequence[Sequence[Scenario]],
+        adversaries_by_base: Sequence[Sequence[tuple[str, ...]]],
+        trials: Any,
     ) -> list[dict[str, Any]]:
-        """Drives what was saved again, grades it, and drives it with other systems; of all cells side by side."""
-        records: list[dict[str, Any]] = [{"metrics": {"replayed": None}} for _ in cells]
+        """Drive the saved scenarios again, grade and prove them, and drive them with other systems."""
+        records: list[dict[str, Any]] = [{"metrics": {"replayed": None, "proven": None}} for _ in cells]
         cell_indices = [cell_index for cell_index, scenarios in enumerate(scenarios_by_base) if scenarios]
         # another seed: a saved collision must not depend on the seed of its search
         seeds = [cells[cell_index].seed + 1 for cell_index in cell_indices]
@@ -271,10 +287,8 @@ class Adversarial(ScenarioKind):
             trials.device,
             seeds=seeds,
         )
-        collisions = [
-            [base for base in (next(replayed_bases) for _ in scenarios_by_base[cell_index]) if has_collision(base)]
-            for cell_index in cell_indices
-        ]
+        replays = [[next(replayed_bases) for _ in scenarios_by_base[cell_index]] for cell_index in cell_indices]
+        collisions = [[base for base in base_replays if has_collision(base)] for base_replays in replays]
         is_graded = cells[0].spec["grade"]
         collision_grades = iter(
             grades_of(
@@ -287,12 +301,14 @@ class Adversarial(ScenarioKind):
                 trials.device,
             )
         )
-        for cell_index, repeated_collisions, transfer_record in zip(
-            cell_indices, collisions, transfer_records, strict=True
+        for cell_index, base_replays, repeated_collisions, transfer_record in zip(
+            cell_indices, replays, collisions, transfer_records, strict=True
         ):
-            metrics = {"replayed": len(repeated_collisions) / len(scenarios_by_base[cell_index])}
-            if is_graded:
-                metrics |= grades([next(collision_grades).metrics() for _ in repeated_collisions], repeated_collisions)
+            metrics: dict[str, Any] = {"replayed": len(repeated_collisions) / len(base_replays)}
+            rows = [next(collision_grades).metrics() for _ in repeated_collisions] if is_graded else None
+            metrics["proven"] = has_proof(base_replays, adversaries_by_base[cell_index], rows)
+            if rows is not None:
+                metrics |= grades(rows, repeated_collisions)
             records[cell_index] = {"metrics": metrics, "transfer": transfer_record}
         return records
 

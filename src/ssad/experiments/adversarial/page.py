@@ -29,7 +29,14 @@ from ssad.report.tables import METHODS, Table, TableCell, TableRow
 TEMPLATE = Path(__file__).with_name("page.html")
 
 RANDOM, ADVERSARIES = "random", "adv-ppo"
-SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving", "attributable")
+SUMMARY = {
+    "survived": "survive plain replay",
+    "proven": "proven",
+    "CR_any": "raw CR",
+    "CR": "CR, lawful",
+    "rollouts": "rollouts to the first",
+    "moving": "ego moves",
+}
 GRADES = {
     "moving": "ego moves",
     "avoided_by_cc": "CC avoids",
@@ -41,14 +48,27 @@ GRADES = {
     "avoided_by_limit": "a manoeuvre avoids",
     "impact_speed": "impact speed, m/s",
 }
-NOTE = "CR: survived bases in which a collision is found; avoidable: of the saved collisions, by a careful driver"
+PROOF = (
+    "Proven: survived bases in which a collision is found that a careful driver avoids, while the ego moves, with the "
+    "adversary on its lawful side, within its vehicle's limits and touching nobody else. Raw CR: any collision with an "
+    "adversary."
+)
 VIEWS = 24
 SEARCH = {"Generator": field("generator"), "System": field("system")}
 
 
 def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a run and its tables."""
-    table_builders = main_table, careful_table, budget_table, against_table, group_table, traffic_table, transfer_table
+    table_builders = (
+        main_table,
+        careful_table,
+        budget_table,
+        against_table,
+        partial(group_table, metric="proven"),
+        group_table,
+        traffic_table,
+        transfer_table,
+    )
     tables = [table for table in (build_table(run) for build_table in table_builders) if table]
     failures = [
         ([str(line["generator"]), str(line["system"]), scenario_of(line)], line["status"], line["reason"])
@@ -60,10 +80,19 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
 def summary(run: Run) -> Table:
     """Return the table for the terminal."""
     full_table = main_table(run)
-    column_indices = [index for index, column in enumerate(run.header["columns"]) if column["name"] in SUMMARY]
-    rows = tuple(replace(row, cells=tuple(row.cells[index] for index in column_indices)) for row in full_table.rows)
-    columns = "survive plain replay", "CR", "rollouts to the first", "distinct", "ego moves", "avoidable"
-    return replace(full_table, columns=columns, rows=rows, note=NOTE)
+    positions = {str(column["name"]): index for index, column in enumerate(run.header["columns"])}
+    rows = tuple(
+        replace(
+            row,
+            cells=tuple(
+                # A run of an earlier version has columns fewer; what it has not measured is n/a.
+                row.cells[positions[name]] if name in positions else TableCell.value(None)
+                for name in SUMMARY
+            ),
+        )
+        for row in full_table.rows
+    )
+    return replace(full_table, columns=tuple(SUMMARY.values()), rows=rows, note=PROOF)
 
 
 def main_table(run: Run) -> Table:
@@ -71,7 +100,7 @@ def main_table(run: Run) -> Table:
     full_table = result_table(run, ("generator", "system"))
     note = (
         f"Over the base scenarios that the system survives in plain replay, {run.suite.get('budget')} rollouts each. "
-        f"{METHODS}"
+        f"{PROOF} {METHODS}"
     )
     return replace(full_table, name="adversarial", title="Generators on equal terms", note=note)
 
@@ -143,17 +172,20 @@ def budget_table(run: Run) -> Table:
 
 
 def against_table(run: Run) -> Table | None:
-    """Return the CR of each generator minus that of random search, over the same bases."""
+    """Return the share of proven collisions and the CR of each generator minus those of random search, by base."""
     random_lines = {system: lines for (generator, system), lines in _searches(run).items() if generator == RANDOM}
 
-    def metric(lines: Sequence[Line], _: str) -> TableCell:
+    def metric(lines: Sequence[Line], name: str) -> TableCell:
+        search_pair = (lines, random_lines[str(lines[0]["system"])])
+        if any(not _measured(search_lines, name) for search_lines in search_pair):
+            return TableCell.value(None)
         generator_cases, random_cases = (
             {
-                f"{scenario_of(line)}#{line['spec']['repetition']}": _case_value(line, _has_found_within(line))
+                f"{scenario_of(line)}#{line['spec']['repetition']}": _case_value(line, metric_of(line, name))
                 for line in search_lines
-                if line["status"] != "ok" or not math.isnan(_has_found_within(line))
+                if line["status"] != "ok" or not math.isnan(metric_of(line, name))
             }
-            for search_lines in (lines, random_lines[str(lines[0]["system"])])
+            for search_lines in search_pair
         )
         return TableCell.of(paired_difference(generator_cases, random_cases, kind="share", min_clusters=MIN_ROUTES))
 
@@ -162,26 +194,28 @@ def against_table(run: Run) -> Table | None:
         "Against random search",
         [line for line in run.lines if str(line["generator"]) != RANDOM and str(line["system"]) in random_lines],
         rows=SEARCH,
-        columns={"CR": "difference of CR"},
+        columns={"proven": "difference of proven", "CR": "difference of CR"},
         metric=metric,
-        note="CR of the generator minus that of random search in the same base scenarios with the same seeds. "
-        f"{METHODS}",
+        note="Shares of the generator minus those of random search in the same base scenarios with the same seeds. "
+        f"CR: with the adversary on its side of the road and hitting nobody else. {METHODS}",
     )
     return table if table.rows else None
 
 
-def group_table(run: Run) -> Table:
-    """Return the CR by group of base scenarios."""
+def group_table(run: Run, metric: str = "CR") -> Table | None:
+    """Return a rate by group of base scenarios; None for proven collisions that no search of the run has measured."""
+    if metric == "proven" and not _measured(run.lines, metric):
+        return None
     return Table.pivot(
-        "groups",
-        "CR by group",
+        "groups" if metric == "CR" else f"{metric}_groups",
+        "CR by group" if metric == "CR" else "Proven collisions by group",
         run.lines,
         rows=SEARCH,
         columns={line["group"]: str(line["group"]) for line in run.lines},
         metric=lambda lines, group: _mean(
-            [line for line in lines if line["group"] == group], _has_found_within, "share"
+            [line for line in lines if line["group"] == group], partial(metric_of, name=metric), "share"
         ),
-        note=METHODS,
+        note=METHODS if metric == "CR" else f"{PROOF} {METHODS}",
     )
 
 
@@ -264,6 +298,11 @@ def collision_views(run: Run) -> list[dict[str, str]]:
         uri = f"data:image/png;base64,{base64.b64encode(encoded).decode()}"
         entries.append({"data": uri, "caption": caption, "command": command})
     return entries
+
+
+def _measured(lines: Sequence[Line], name: str) -> bool:
+    """Return True if a line has measured a metric."""
+    return any(not math.isnan(metric_of(line, name)) for line in lines)
 
 
 def _searches(run: Run) -> dict[tuple[str, str], list[Line]]:

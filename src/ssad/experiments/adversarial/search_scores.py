@@ -16,6 +16,7 @@ from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, AgentKind, EpisodeTrace
+from ssad.metrics.proven_collisions import MOVING
 from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein
 from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
@@ -24,7 +25,6 @@ EPISODES: Final = 12  # of the reference
 MIN_TRAVEL: Final = 5.0  # m; who moves less is parked and says nothing
 MIN_DIFFERENCE: Final = 1.0  # m by which motions before contact differ on average, to count as distinct
 COMPARED_SECONDS: Final = 3.0  # s of motion that are compared
-MOVING: Final = 0.5  # m/s; an ego that is slower when it is hit stands
 REPORTED_FEATURES: Final = ("speed", "acceleration", "yaw_rate", "nearest")
 
 

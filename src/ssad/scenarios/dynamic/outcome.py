@@ -6,10 +6,10 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from ssad.core.generators import Base, Outcome, Proposal
+from ssad.core.generators import Outcome, Proposal
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F64, AgentKind, Body, EpisodeTrace, Model
+from ssad.core.types import F64, AgentKind, Body, EpisodeTrace, Model, Scenario
 from ssad.metrics.criticality import trace_boxes
 from ssad.metrics.driving import first_contact
 from ssad.metrics.proven_collisions import (
@@ -24,7 +24,7 @@ from ssad.metrics.proven_collisions import (
     wrong_way_steps,
 )
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
-from ssad.world.models import acceleration_limits, agent_model, lateral_grip, model, model_with_body
+from ssad.world.models import acceleration_limits, lateral_grip, model, model_with_body
 from ssad.world.roads.query import LaneQuery
 
 WINDOW = 0.5  # s over which jerks are means; accelerations are those of each step
@@ -123,24 +123,47 @@ def _leaves_road(trace: EpisodeTrace, graph: LaneGraph, agent: int) -> bool:
     return bool(wrong_way[-1]) or longest_run(wrong_way) >= round(WRONG_WAY_TIME / trace.dt)
 
 
-def proof_of(base: Base, adversaries: Collection[str], *, avoidable: bool | None = None) -> CollisionProof:
-    """Check the conditions of a proven collision in a drive that ends in one.
+def proof_of(
+    scenario: Scenario,
+    trace: EpisodeTrace,
+    graph: LaneGraph,
+    adversaries: Collection[str],
+    *,
+    avoidable: bool | None = None,
+) -> CollisionProof:
+    """Check the conditions of a proven collision in a drive that has a contact.
 
     Args:
-        base: The drive.
+        scenario: The driven scenario, which states bodies and the surface.
+        trace: The drive.
+        graph: Lane graph of the town.
         adversaries: Names of the agents that are adversaries.
         avoidable: Whether a careful driver avoids the collision; None: not graded.
 
     Returns:
         The conditions.
     """
-    trace = base.trace
     _, agent = first_contact(trace)
     limits = None
     if agent > 0 and trace.kind[agent] <= AgentKind.BICYCLE:
-        limits = acceleration_budget(agent_model(base.episode.agents[agent]), base.scenario.friction)
+        body = next((actor.body for actor in scenario.actors if actor.name == trace.names[agent]), Body())
+        limits = acceleration_budget(model_with_body(model(trace.models[agent]), body), scenario.friction)
     indices = [index for index, name in enumerate(trace.names) if name in adversaries]
-    return prove_collision(trace, base.graph, indices, limits, avoidable=avoidable)
+    return prove_collision(trace, graph, indices, limits, avoidable=avoidable)
+
+
+def adversary_names(outcome: Outcome) -> tuple[str, ...]:
+    """Return the names of the adversaries of a driven proposal."""
+    return tuple(outcome.trace.names[agent] for agent in outcome.adversaries) if outcome.trace is not None else ()
+
+
+def is_candidate(outcome: Outcome, graph: LaneGraph) -> bool:
+    """Return True if an outcome is a valid collision that would be proven if a careful driver avoids it."""
+    return (
+        outcome.is_valid
+        and outcome.trace is not None
+        and proof_of(outcome.proposal.scenario, outcome.trace, graph, adversary_names(outcome)).is_candidate
+    )
 
 
 def acceleration_budget(body: Model, friction: float) -> Accelerations:
