@@ -25,6 +25,7 @@ from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import Episode
 from ssad.drivers import LEARNED, make_system
 from ssad.drivers import SYSTEMS as REGISTERED
+from ssad.experiments.adversarial.found_collisions import proven_bases
 from ssad.experiments.scenario_kind import route_key
 from ssad.metrics import CaseValue, Estimate, episode_metrics, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
@@ -121,10 +122,12 @@ def attack(name: str, adversaries: Sequence[str]) -> dict[str, Any]:
             for count in (1, 2) if adversary else (0,):
                 drivers = {FreaSelection(count=count): Adversary(name=adversary)} if adversary else {}
                 found = outcomes(trials, episodes, graphs, drivers) if adversary else natural
+                bases = [Base(e, graphs[e.town], None) for e in episodes]
+                proven = proven_bases(bases, [[o] for o in found], trials, limit=1) if adversary else None
                 for town in (*sorted(graphs), " + ".join(sorted(graphs))):
                     here = [k for k, e in enumerate(episodes) if town in (e.town, " + ".join(sorted(graphs)))]
                     parts = ([rows[k] for k in here] for rows in (episodes, found, natural))
-                    row = measured(*parts)
+                    row = measured(*parts, None if proven is None else [proven[k] for k in here])
                     table.setdefault(town, {}).setdefault(ego, {})[f"{adversary} x {count}" if adversary else ""] = row
                     print(
                         town, ego, adversary, count, *(f"{key} {text(value)}" for key, value in row.items()), flush=True
@@ -138,8 +141,13 @@ def outcomes(trials: Trials, episodes: Sequence[Episode], graphs: Any, drivers: 
     return trials.run(bases)
 
 
-def measured(episodes: Sequence[Episode], found: Sequence[Outcome], natural: Sequence[Outcome]) -> dict[str, Any]:
-    """Shares of the episodes, and how many more collisions than in natural traffic."""
+def measured(
+    episodes: Sequence[Episode],
+    found: Sequence[Outcome],
+    natural: Sequence[Outcome],
+    proven: Sequence[bool] | None = None,
+) -> dict[str, Any]:
+    """Shares of the episodes, and how many more collisions than in natural traffic; proven: None without adversary."""
 
     def crashed(outcome: Outcome) -> bool:
         return outcome.trace is not None and outcome.trace.end == "collision"
@@ -149,7 +157,7 @@ def measured(episodes: Sequence[Episode], found: Sequence[Outcome], natural: Seq
         "valid": [o.is_valid for o in found],
         "off": [o.off_road for o in found],
         "others": [o.hit_others for o in found],
-    }
+    } | ({} if proven is None else {"proven": list(proven)})
     rows = {
         key: rate([case(e, v) for e, v in zip(episodes, column, strict=True)], "share")
         for key, column in values.items()
@@ -187,13 +195,18 @@ def driver_table(data: dict[str, Any]) -> list[str]:
 
 def adversary_table(data: dict[str, Any]) -> list[str]:
     """Egos and adversaries by town."""
-    head = "| town | ego | adversaries | CR | more than without | collides on the road, hitting nobody else "
-    lines = [head + "| adversary leaves the road | published CR |", "|---|---|---|---|---|---|---|---|"]
+    head = "| town | ego | adversaries | proven | CR | more than without | collides on the road, hitting nobody else "
+    lines = [head + "| adversary leaves its side of the road | published CR |", "|---|---|---|---|---|---|---|---|---|"]
     for towns in data.values():
         for town, egos in towns.items():
             for ego, rows in egos.items():
                 for adversary, row in rows.items():
-                    cells = [text(row["CR"]), *(text(row[k]) if adversary else "" for k in ("more", "valid", "off"))]
+                    proven = (text(row["proven"]) if "proven" in row else "n/a") if adversary else ""
+                    cells = [
+                        proven,
+                        text(row["CR"]),
+                        *(text(row[k]) if adversary else "" for k in ("more", "valid", "off")),
+                    ]
                     known = PUBLISHED.get(ego, {}).get(town)
                     other = f"{known[bool(adversary)]:.2f}" if known and adversary in ("", "adv-ppo x 1") else ""
                     lines.append(f"| {town} | {ego} | {adversary or 'none'} | {' | '.join(cells)} | {other} |")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ssad.drivers import make_system
+from ssad.experiments.adversarial.found_collisions import proven_bases
 from ssad.metrics import CaseValue, Estimate, estimate, paired_difference
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
@@ -24,11 +25,12 @@ from ssad.world.roads import load_town
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "searches.json"
 DOCUMENT = ROOT / "docs" / "results" / "generators.md"
+KEPT = 3  # distinct collisions of a search that are driven again and graded, as in kind `adversarial`
 BEGIN, END = "<!-- searches: begin -->", "<!-- searches: end -->"
 
 
 def measure(name: str, *, system: str, set_name: str, seeds: int, budget: int) -> dict[str, Any]:
-    """Rollouts to the first collision that counts (None: not found), of each base and seed."""
+    """Rollouts to the first collision that counts (None: not found), and proofs, of each base and seed."""
     trials = Trials(lambda: make_system(system), make_system)
     scenarios = load_scenarios(set_name)
     bases = [trials.base(scenario, load_town(scenario.town), seed=0) for scenario in scenarios]
@@ -42,11 +44,15 @@ def measure(name: str, *, system: str, set_name: str, seeds: int, budget: int) -
     many = [base for base in alive for _ in range(seeds)]
     roots = [seed for _ in alive for seed in range(seeds)]
     outcomes = search(factory(many, seeds=roots, budget=budget), many, trials, budget=budget)
-    for base, row in zip(many, outcomes, strict=True):
+    proven: dict[str, list[bool]] = {}
+    collided: dict[str, list[bool]] = {}
+    for base, row, is_proven in zip(many, outcomes, proven_bases(many, outcomes, trials, limit=KEPT), strict=True):
+        proven.setdefault(base.scenario.name, []).append(is_proven)
+        collided.setdefault(base.scenario.name, []).append(any(outcome.collision for outcome in row))
         first = next((k for k, outcome in enumerate(row, 1) if outcome.is_valid), None)
         found.setdefault(base.scenario.name, []).append(first)
         share.setdefault(base.scenario.name, []).append(float(np.mean([outcome.is_valid for outcome in row])))
-    return {"first": found, "share": share}
+    return {"first": found, "share": share, "proven": proven, "any": collided}
 
 
 def cases(rows: dict[str, list[Any]], value: Any) -> dict[str, CaseValue]:
@@ -60,11 +66,25 @@ def text(found: Estimate, *, sign: bool = False) -> str:
     return f"{found.mean:{form}} [{found.low:{form}}, {found.high:{form}}]"
 
 
+def headline_cells(measured: dict[str, Any], name: str) -> list[str]:
+    """Share of the bases with a proven collision, the same less random's, and the raw CR; n/a: not measured."""
+    row, random = measured[name], measured["random"]
+    proven = cases(row["proven"], float) if "proven" in row else None
+    less = "" if name == "random" else "n/a"
+    if proven is not None and "proven" in random and name != "random":
+        less = text(paired_difference(proven, cases(random["proven"], float)), sign=True)
+    raw = text(estimate(cases(row["any"], float).values(), "bounded")) if "any" in row else "n/a"
+    return ["n/a" if proven is None else text(estimate(proven.values(), "bounded")), less, raw]
+
+
 def table(data: dict[str, Any]) -> list[str]:
     """Generators by how much of the bases they break, and how much sooner than random search."""
     budget = data["budget"]
     parts = [budget // 4, budget]
     heads = [
+        "proven",
+        "proven, less random's",
+        "raw CR",
         *(f"CR within {n}" for n in parts),
         *(f"CR within {n}, less random's" for n in parts),
         "share of rollouts",
@@ -74,6 +94,7 @@ def table(data: dict[str, Any]) -> list[str]:
     measured = data["generators"]
     for name in measured:
         cells, more = [], []
+        headline = headline_cells(measured, name)
         for most in parts:
             own, random = (
                 cases(measured[who]["first"], lambda first, most=most: first is not None and first <= most)
@@ -83,7 +104,9 @@ def table(data: dict[str, Any]) -> list[str]:
             more.append("" if name == "random" else text(paired_difference(own, random), sign=True))
         own, random = (cases(measured[who]["share"], float) for who in (name, "random"))
         last = ["" if name == "random" else text(paired_difference(own, random), sign=True)]
-        lines.append(f"| `{name}` | {' | '.join([*cells, *more, text(estimate(own.values(), 'bounded')), *last])} |")
+        lines.append(
+            f"| `{name}` | {' | '.join([*headline, *cells, *more, text(estimate(own.values(), 'bounded')), *last])} |"
+        )
     bases = len(measured["random"]["first"])
     head = f"{bases} bases of `{data['set']}`, {data['seeds']} seeds each, {budget} rollouts, `{data['system']}`:"
     return [head, "", *lines, ""]
