@@ -168,8 +168,12 @@ def test_boxes_and_scores_are_those_of_the_network(layout: str, dynamic: bool, e
     torch.testing.assert_close(dense.box, box, rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(dense.logit.sigmoid(), rows[..., -3:], rtol=1e-4, atol=1e-5)
     assert (dense.quality is None) == (layout == "yolov8")
+    score = rows[..., -3:]
     if dense.quality is not None:
         torch.testing.assert_close(dense.quality.sigmoid(), rows[..., 4], rtol=1e-4, atol=1e-5)
+        score = score * rows[..., 4:5]  # of YOLOv5 and YOLOX a box has the score of its class times its objectness
+    for found, best in zip(detector.predict(images, threshold=0.01), score.amax((1, 2)), strict=True):
+        torch.testing.assert_close(found.score[0], best, rtol=1e-4, atol=1e-5)
 
 
 def test_places_are_the_cells_of_each_level(exported: Callable[..., Path]) -> None:
