@@ -17,6 +17,7 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from ssad.core.types import (
     Scenario,
     SignalState,
 )
+from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
@@ -90,7 +92,9 @@ def town_routes(graph: LaneGraph, count: int, length: float) -> list[Route]:
     return routes
 
 
-def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: int, green: bool) -> Episode:
+def traffic(
+    graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: int, green: bool, drivers: str = "uniform"
+) -> Episode:
     """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads."""
     draws = generator("traffic", graph.name, key)
     agents: list[EpisodeAgent] = []
@@ -106,7 +110,11 @@ def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: in
         wish = float(draws.uniform(0.75, 1.05)) * float(route.speed_limit.max())
         start = 0.6 * min(wish, float(route.speed_limit[0]))
         pose = Pose(x, y, float(route.yaw[0]))
-        agents.append(EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route))
+        agent = EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route)
+        if drivers == "population":
+            # how fast it likes to go is its driver's pace
+            agent = with_driver(replace(agent, target_speed=float(route.speed_limit.max())), key, len(agents))
+        agents.append(agent)
     limits = EpisodeLimits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
     scenario = Scenario(f"traffic/{key}", "Custom", graph.name, (agents[0].pose, agents[0].pose), limits=limits)
     real = np.flatnonzero(~graph.signal_virtual).tolist()
@@ -184,7 +192,8 @@ def drive_batch(row: Row, graph: LaneGraph, routes: Sequence[Route], given: argp
     """Add as many scenes to a town's row as its hours need, but no more than are driven side by side."""
     need = math.ceil((given.hours - row["hours"]) * 60.0 / (given.vehicles * given.minutes))
     keys = range(given.first + row["scenes"], given.first + row["scenes"] + max(1, min(given.scenes, need)))
-    episodes = [traffic(graph, routes, given.vehicles, key=k, green=given.signals == "green") for k in keys]
+    green = given.signals == "green"
+    episodes = [traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers) for k in keys]
     part = measure(graph, episodes, seconds=60.0 * given.minutes, device=given.device)
     row["scenes"] += len(keys)
     for name, value in part.items():
@@ -218,6 +227,7 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=40, help="in each scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
     parser.add_argument("--scenes", type=int, default=128, help="at most so many side by side")
+    parser.add_argument("--drivers", choices=("uniform", "population"), default="uniform")
     parser.add_argument("--signals", choices=("program", "green"), default="program")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
@@ -231,6 +241,7 @@ def main() -> None:
         compare_with_people(given)
         return
     traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
+    traffic_of |= {} if given.drivers == "uniform" else {"drivers": given.drivers}
     about = traffic_of | {"first": given.first}
     rows = kept(given.json, about) if given.json and given.json.is_file() else {}
     heads = ("town", "hours", "contacts", "per 100 h", "95 % up", "off road", "stuck", "s")
@@ -262,7 +273,7 @@ def compare_with_people(given: argparse.Namespace) -> None:
     """Measure the traffic beside published statistics of human driving; print, and write."""
     from benchmarks.traffic_human import drive_town, load, show, write_page
 
-    about = {"world": VERSION, "drivers": "uniform", "vehicles": given.vehicles, "minutes": given.minutes}
+    about = {"world": VERSION, "drivers": given.drivers, "vehicles": given.vehicles, "minutes": given.minutes}
     towns = load(given.json)["towns"] if given.json and given.json.is_file() else []
     measured = {town["town"] for town in towns}
     scenes = max(1, math.ceil(given.hours * 60.0 / (given.vehicles * given.minutes)))
@@ -272,7 +283,8 @@ def compare_with_people(given: argparse.Namespace) -> None:
             continue
         routes = town_routes(graph, ROUTES, LENGTH)
         keys = range(given.first, given.first + scenes)
-        episodes = [traffic(graph, routes, given.vehicles, key=k, green=given.signals == "green") for k in keys]
+        green = given.signals == "green"
+        episodes = [traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers) for k in keys]
         size = min(given.scenes, RECORDED)
         batches = [episodes[first : first + size] for first in range(0, scenes, size)]
         towns.append(drive_town(graph, batches, seconds=60.0 * given.minutes, device=given.device))

@@ -160,6 +160,6 @@ def test_a_sweep_runs_with_a_matrix_and_replays(tmp_path: Path) -> None:
     assert "matrix.csv" in page
     assert len((folder / "tables" / "matrix.csv").read_text().splitlines()) == 1 + 3 * 3
     (matrix,) = matrices(folder)
-    assert "n = 2 drives behind it in 1 cluster" in matrix.note
+    assert "n = 2 cases behind it in 1 cluster" in matrix.note
     drawn = next(cell.key for cell in read_plan(folder).cells if cell.name.endswith("#1"))
     assert replay(folder, drawn).difference is None

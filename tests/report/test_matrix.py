@@ -46,7 +46,7 @@ def test_rows_and_columns_are_those_of_the_suite() -> None:
     assert first.columns == ("2", "8")
     assert [row.head[0] for row in first.rows] == ["1.5", "3", "9"]
     assert [[cell.mean for cell in row.cells] for row in first.rows] == [[0.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
-    assert "n = 1 drive behind it" in first.note
+    assert "n = 1 case behind it" in first.note
     assert "no interval is taken" in first.note
 
 
@@ -61,7 +61,7 @@ def test_further_parameters_have_matrices_of_their_own_up_to_a_number() -> None:
     assert [[cell.mean for cell in row.cells] for row in few[0].rows] == [[0.0, 0.0], [0.0, 1.0]]
     values = [float(value) for value in range(MAX_SLICES + 1)]
     (mean,) = run_matrices(sweep_run({"a": [1.0, 2.0], "b": [3.0, 4.0], "c": values}, matrix=["a", "b"]))
-    assert "mean over c (7 values). n = 7 drives behind it in 1 cluster" in mean.note
+    assert "mean over c (7 values). n = 7 cases behind it in 1 cluster" in mean.note
     assert [cell.mean for row in mean.rows for cell in row.cells] == pytest.approx([0.0, 1 / 7, 1 / 7, 2 / 7])
 
 
@@ -106,4 +106,4 @@ def test_the_terminal_shows_wide_matrices_in_blocks() -> None:
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
     assert len(terminal_matrices(run)[0].blocks(80)) > 1
-    assert text.count("n = 1 drive") == 1
+    assert text.count("n = 1 case") == 1

@@ -44,9 +44,9 @@ def test_an_unknown_model_is_named() -> None:
 
 
 def test_limits_are_the_lower_ones_of_vehicle_and_surface() -> None:
-    assert acceleration_limits(agent(), 0.9) == (3.5, 8.0)
-    assert acceleration_limits(agent(), 0.2) == (0.2 * GRAVITY, 0.2 * GRAVITY)
-    assert acceleration_limits(agent(max_brake=1.5), 0.2) == (0.2 * GRAVITY, 1.5)
+    assert acceleration_limits(MODELS["car"], 0.9) == (3.5, 8.0)
+    assert acceleration_limits(MODELS["car"], 0.2) == (0.2 * GRAVITY, 0.2 * GRAVITY)
+    assert acceleration_limits(agent_model(agent(max_brake=1.5)), 0.2) == (0.2 * GRAVITY, 1.5)
 
 
 def test_only_sizes_other_than_the_models_are_stated() -> None:

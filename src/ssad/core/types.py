@@ -419,6 +419,37 @@ class SignalPlan:
 
 
 @dataclass(frozen=True)
+class DriverStyle:
+    """Parameters of one driver of background traffic, in place of those that all Autopilots have.
+
+    Attributes:
+        time_gap: Desired time gap to the leader, s.
+        standstill_gap: Gap to a standing leader, m.
+        acceleration: Acceleration from rest, m/s^2.
+        deceleration: Comfortable deceleration, m/s^2.
+        pace: Desired speed over the speed limit; lateral acceleration in bends goes with its square.
+        jerk: Jerk of ordinary driving, m/s^3.
+        reaction_time: Time until the driver begins to brake, or starts, s.
+        estimation_error: Relative standard deviation of gaps as the driver judges them.
+        lane_offset: Mean place left of the middle of the lane, m.
+        errors: Errors an hour: a moment in which the driver reacts late and misses who has priority.
+        key: Number from which the driver's errors are drawn, below 2^24.
+    """
+
+    time_gap: float
+    standstill_gap: float
+    acceleration: float
+    deceleration: float
+    pace: float = 1.0
+    jerk: float = 3.0
+    reaction_time: float = 0.0
+    estimation_error: float = 0.0
+    lane_offset: float = 0.0
+    errors: float = 0.0
+    key: int = 0
+
+
+@dataclass(frozen=True)
 class TrafficPlan:
     """Random background vehicles (FREA).
 
@@ -428,6 +459,9 @@ class TrafficPlan:
         maximum: Maximum number of vehicles.
         wake_distance: Distance of the ego at which a vehicle wakes, m; 0: it is awake from the start.
         draw: Number of the draw of vehicles, which is then the same in every episode; None: the episode's seed.
+        drivers: `uniform`: all vehicles have the Autopilot's parameters. `population`: each has a driver drawn from
+            published distributions.
+        errors: Errors of each driver of the population an hour; see `DriverStyle`.
     """
 
     intensity: float = 0.3
@@ -435,6 +469,8 @@ class TrafficPlan:
     maximum: int = 18
     wake_distance: float = 50.0
     draw: int | None = None
+    drivers: Literal["uniform", "population"] = "uniform"
+    errors: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -568,6 +604,7 @@ class EpisodeAgent:
         trajectory: See `Actor`.
         policy: See `Actor`.
         body: Dimensions and limits that differ from those of the model.
+        driver: Parameters of its driver under AUTOPILOT; None: those that all Autopilots have.
         lateral: Lateral phases under SCRIPT; they need a route.
         lateral_targets: Distance left of the route to which each lateral phase leads, at every route point [N], m.
     """
@@ -586,6 +623,7 @@ class EpisodeAgent:
     body: Body = Body()
     lateral: tuple[LateralPhase, ...] = ()
     lateral_targets: tuple[F32, ...] = ()
+    driver: DriverStyle | None = None
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from ssad.report.artefacts import pictures
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.records import Line, field, metric_cell
-from ssad.report.tables import METHODS, Table, TableCell
+from ssad.report.records import SWEEP, field, result_cell
+from ssad.report.tables import METHODS, Table
+
+MAX_POINTS: Final = 60
+"""Most points of a sweep that are rows of their own in the table."""
 
 
 def section(run: Run, *, verdict: Sequence[str] = (), note: str = "") -> tuple[str, Sequence[Table]]:
@@ -55,17 +57,24 @@ def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
         "results",
         "Results",
         run.lines,
-        rows={name.replace("_", " "): field(name) for name in factors or _factors(run)},
+        rows={name.removeprefix(SWEEP).replace("_", " "): field(name) for name in factors or _factors(run)},
         columns=titles,
-        metric=_cell,
+        metric=result_cell,
         note=" ".join([*notes, METHODS]),
     )
     return replace(table, clock=tuple(titles[name] for name, column in columns.items() if column.get("clock")))
 
 
 def _factors(run: Run) -> list[str]:
-    """Return the fields that tell rows apart: the kind's, else the common ones of the lines, else the key."""
+    """Return the fields that tell rows apart: the kind's, else the common ones of the lines, else the key.
+
+    The points of a sweep are rows of their own, unless there are very many.
+    """
     kind_factors = [str(name) for name in run.header.get("factors") or []]
+    swept_fields = sorted({name for line in run.lines for name in line if name.startswith(SWEEP)})
+    points = {tuple(line.get(name) for name in swept_fields) for line in run.lines}
+    if kind_factors and len(points) <= MAX_POINTS:
+        kind_factors += swept_fields
     common_fields = [name for name in ("system", "detector", "group", "shift", "severity") if name in run.lines[0]]
     return kind_factors or common_fields or ["key"]
 
@@ -73,16 +82,3 @@ def _factors(run: Run) -> list[str]:
 def _title(column: Mapping[str, Any]) -> str:
     unit = column.get("unit")
     return str(column.get("title") or column["name"]) + (f", {unit}" if unit else "")
-
-
-def _cell(lines: Sequence[Line], name: str) -> TableCell:
-    """Return a metric over the lines of a row: one line's own interval if it has one, else that of the clusters."""
-    values = [(line.get("metrics") or {}).get(name) if line["status"] == "ok" else None for line in lines]
-    own_interval = (lines[0].get("intervals") or {}).get(name) if len(lines) == 1 else None
-    if own_interval and values[0] is not None:
-        lower, upper = (math.nan if limit is None else float(limit) for limit in own_interval)
-        return TableCell(float(values[0]), lower, upper, int(lines[0].get("n", 1)), method="given")
-    are_booleans = [isinstance(value, bool) for value in values if value is not None]
-    cell = metric_cell(lines, name, "share" if are_booleans and all(are_booleans) else "mean")
-    is_count = len(values) == 1 and type(values[0]) is int
-    return replace(cell, digits=0 if is_count or abs(cell.mean) >= 1000 else 1 if abs(cell.mean) >= 100 else 2)

@@ -7,14 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeGuard
 
 from ssad.metrics import METRICS
-from ssad.metrics.uncertainty import Kind
 from ssad.report.load import Run
-from ssad.report.records import Line, metric_cell
+from ssad.report.records import SWEEP, Line, result_cell
 from ssad.report.tables import Table, TableCell, TableRow
 from ssad.report.terminal import TerminalRow, TerminalTable
 
-SWEEP: Final = "sweep."
-"""Start of the names of the fields that have the values of swept parameters."""
 MAX_SLICES: Final = 6
 """Most values of further parameters that have matrices of their own; over more of them the matrix is a mean."""
 BETWEEN: Final = " \\ "  # between the parameters in the rows and in the columns
@@ -40,34 +37,30 @@ def sweep_tables(run: Run) -> list[Table]:
 
 def run_matrices(run: Run) -> list[Table]:
     """Return the matrices of a run, of the metric and with the rows and columns that its suite names."""
-    name = str(run.suite.get("matrix_metric") or "CR")
-    titles = {column["name"]: column for column in run.header.get("columns") or []}
-    is_recorded = any(name in (record.get("metrics") or {}) for record in run.lines)
-    metric = METRICS[name].field or name if name in METRICS and not is_recorded else name
-    column = titles.get(name) or {}
+    columns = {str(column["name"]): column for column in run.header.get("columns") or []}
+    recorded = {metric for record in run.lines for metric in record.get("metrics") or {}}
+
+    def record_name(name: str) -> str:
+        return METRICS[name].field or name if name in METRICS and name not in recorded else name
+
+    chosen = run.suite.get("matrix_metric")
+    name = str(chosen or next((name for name in ("CR", *columns) if record_name(name) in recorded), "CR"))
+    metric = record_name(name)
+    column = columns.get(name) or {}
     unit = f", {column['unit']}" if column.get("unit") else ""
     metric_title = f"{column.get('title') or name}{unit}"
     axes = [str(axis) for axis in run.suite.get("matrix") or ()]
     metric_title = metric_title[:1].upper() + metric_title[1:]
-    return matrix_tables(run, metric, metric_title, kind=_kind_of(run.lines, metric), axes=axes)
+    return matrix_tables(run, metric, metric_title, axes=axes)
 
 
-def _kind_of(records: Sequence[Line], metric: str) -> Kind:
-    """Return the kind of the values of a metric: shares are truth values, or 0 and 1 alone."""
-    values = [value for record in records if (value := (record.get("metrics") or {}).get(metric)) is not None]
-    return "share" if values and all(value in (0, 1) for value in values) else "mean"
-
-
-def matrix_tables(
-    run: Run, metric: str, metric_title: str, *, kind: Kind = "share", axes: Sequence[str] = ()
-) -> list[Table]:
+def matrix_tables(run: Run, metric: str, metric_title: str, *, axes: Sequence[str] = ()) -> list[Table]:
     """Return the matrix tables of a run with a sweep.
 
     Args:
         run: The run.
         metric: Metric of the records that the cells show.
         metric_title: Title of the metric.
-        kind: Kind of its values; see `ssad.metrics.uncertainty.estimate`.
         axes: Parameters in the rows and the columns; empty: the first two that have several values.
 
     Returns:
@@ -98,7 +91,7 @@ def matrix_tables(
                 scenario_text = scenario_name if has_several_scenarios else ""
                 subject = ", ".join(filter(None, [system_name, scenario_text, *point_texts]))
                 table_rows = _matrix_rows(
-                    slice_records, row_name, column_name, lambda cases: metric_cell(cases, metric, kind)
+                    slice_records, row_name, column_name, lambda cases: result_cell(cases, metric)
                 )
                 tables.append(
                     Table(
@@ -156,7 +149,7 @@ def _point_table(run: Run) -> Table:
             **{name: _parameter_factor(name) for name in swept_parameters(run)},
         },
         columns={name: name for name in metrics},
-        metric=lambda records, name: metric_cell(records, name, _kind_of(run.lines, name)),
+        metric=result_cell,
         note=NOTE,
     )
 
@@ -169,12 +162,12 @@ def _count_note(table_rows: Iterable[TableRow], mean_note: str) -> str:
     """Return in sentences how many cases are behind the numbers of a matrix."""
     filled = [table_cell for row in table_rows for table_cell in row.cells if table_cell.n or table_cell.failed]
     if not filled:
-        return "No drive of these points ran."
+        return "No cell of these points ran."
     fewest, most = min(table_cell.n for table_cell in filled), max(table_cell.n for table_cell in filled)
     clusters = max(table_cell.clusters for table_cell in filled)
     count = str(fewest) if fewest == most else f"{fewest} to {most}"
     cluster_text = f" in {clusters} cluster{'s' if clusters > 1 else ''}" if most > 1 else ""
-    noun = "drive" if most == 1 else "drives"
+    noun = "case" if most == 1 else "cases"
     return f"{mean_note or 'Each number is of one point of the grid.'} n = {count} {noun} behind it{cluster_text}."
 
 

@@ -326,6 +326,12 @@ def _put_agent(  # noqa: PLR0917
     a["controller"][e, i] = int(agent.controller)
     a["start"][e, i] = agent.pose.x, agent.pose.y, agent.pose.yaw, agent.speed
     a["cruise"][e, i] = agent.target_speed, agent.wake_distance
+    a["manner"][e, i] = 1.0, 0.0, 0.0, 0.0
+    driver = agent.driver
+    if driver is not None:
+        a["style"][e, i] = driver.time_gap, driver.standstill_gap, driver.acceleration, driver.deceleration
+        a["manner"][e, i] = driver.pace, driver.jerk, driver.reaction_time, driver.estimation_error
+        a["habit"][e, i] = driver.lane_offset, driver.errors, driver.key
     a["route"][e, i] = route
     a["track"][e, i] = track
 
@@ -400,6 +406,9 @@ def build(  # noqa: PLR0917
         "model": np.full(shape, -1, np.int32),
         "controller": np.zeros(shape, np.int32),
         "start": np.zeros((*shape, 4), np.float32),
+        "style": np.zeros((*shape, 4), np.float32),
+        "manner": np.zeros((*shape, 4), np.float32),
+        "habit": np.zeros((*shape, 3), np.float32),
         "cruise": np.zeros((*shape, 2), np.float32),
         "route": np.zeros((*shape, 2), np.int32),
         "track": np.zeros((*shape, 2), np.int32),

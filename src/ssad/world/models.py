@@ -98,10 +98,9 @@ def model_with_body(base: Model, body: Body) -> Model:
     return replace(base, **stated) if stated else base
 
 
-def acceleration_limits(agent: EpisodeAgent, friction: float) -> tuple[float, float]:
-    """Return the maximum acceleration and deceleration of an agent on a surface, m/s^2."""
-    limits = agent_model(agent)
-    return min(limits.max_accel, friction * GRAVITY), min(limits.max_brake, friction * GRAVITY)
+def acceleration_limits(body: Model, friction: float) -> tuple[float, float]:
+    """Return the maximum acceleration and deceleration of a model on a surface, m/s^2."""
+    return min(body.max_accel, friction * GRAVITY), min(body.max_brake, friction * GRAVITY)
 
 
 def lateral_grip(friction: float) -> float:

@@ -156,6 +156,7 @@ class World:
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
+        self.work.judgement = wp.zeros((self.batch, self.agents), dtype=wp.vec2, device=device)
         if self.chance is not None:
             self.noise = noise_state(self.chance, self.episodes, assignment, self.agents, device)
         self._assign(assignment)
@@ -737,6 +738,9 @@ class World:
             hasher = hashlib.sha256()
             for name, values in arrays.items():
                 scene_values = values[scene]
+                if name == "pending" and not scene_values.any():
+                    # hashes are those of before there were drivers that react
+                    continue
                 if name.startswith("script."):
                     if not scene_values.any():
                         continue  # a scene without scripts has the hash that it has in a world without scripts

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.large_map import SPACING, TOWN, large_map
+from benchmarks.opendrive_maps import integrated_centre
 from ssad.core.errors import MapError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph, SignKind, load_graph
 from ssad.core.types import LaneType
-from ssad.world.roads import bake, import_map
+from ssad.world.roads import bake, import_map, load_town, town_xodr
+from ssad.world.roads.lane_sampling import LaneSampler
+from ssad.world.roads.xodr import read_network
 
 WIDTH = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
 
@@ -518,3 +522,32 @@ def test_the_user_decides_on_turns_on_red(tmp_path: Path, ssad_home: Path, wante
     town(tmp_path, road())
     stored = import_map(tmp_path / "map.xodr", "Own", ssad_home, turn_on_red=wanted)
     assert load_graph(stored).turn_on_red.tolist() == [wanted]
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<spiral curvStart="-0.01" curvEnd="0.03"/>',
+        '<paramPoly3 aU="0" bU="40" cU="180" dU="-120" aV="0" bV="0" cV="20" dV="-12" pRange="normalized"/>',
+        '<poly3 a="0" b="0" c="0.002" d="-0.00001"/>',
+    ],
+)
+def test_centres_are_those_of_an_adaptive_quadrature(tmp_path: Path, shape: str) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(f"<OpenDRIVE>{road(heading=0.7, shape=shape)}</OpenDRIVE>", encoding="utf-8")
+    sampler = LaneSampler(read_network(path))
+    samples = sampler.lanes([(1, 0, -1), (1, 0, 1)])
+    for index in range(0, samples.first[1], 20):
+        exact = integrated_centre(sampler, 1, float(samples.s[index]), samples.xy[index])
+        assert samples.xy[index] == pytest.approx(exact, abs=1e-5)
+
+
+def test_a_map_of_copies_has_the_lanes_of_each(tmp_path: Path) -> None:
+    """What `benchmarks.large_map` measures is a map of separate towns, none of whose lanes is lost."""
+    town_graph = load_town(TOWN)
+    path = tmp_path / "copies.xodr"
+    path.write_bytes(large_map(1.2 * len(town_xodr(TOWN))))
+    graph = bake(path)
+    assert graph.lane_count == 2 * town_graph.lane_count
+    assert len(graph.succ) == 2 * len(town_graph.succ)
+    assert np.ptp(graph.xy[:, 0]) == pytest.approx(np.ptp(town_graph.xy[:, 0]) + SPACING, abs=0.1)

@@ -30,6 +30,7 @@ from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._impact import place_actors
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import move_pose
+from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
 from ssad.scenarios.dynamic.sampling import sample_parameters
 from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import agent_model
@@ -112,6 +113,11 @@ def _build_one(
     # A scenario with a fixed draw has the same traffic under every seed.
     draw = seed if fixed_draw is None else fixed_draw
     other_agents = scenario_kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
+    if scenario.traffic and scenario.traffic.drivers == "population":
+        other_agents = [
+            with_driver(agent, scenario.seed, draw, number, errors=scenario.traffic.errors)
+            for number, agent in enumerate(other_agents)
+        ]
     if scenario.signals.ego == "red" and not graph.turn_on_red[0] and near_side_turns(graph, route):
         raise RouteError(
             f"scenario {scenario.name}: its ego turns on red, which town '{graph.name}' forbids; choose another"

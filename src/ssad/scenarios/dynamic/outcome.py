@@ -13,7 +13,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Body, EpisodeTrace, Model
 from ssad.metrics.criticality import trace_boxes
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
-from ssad.world.models import GRIP, model, model_with_body
+from ssad.world.models import acceleration_limits, lateral_grip, model, model_with_body
 from ssad.world.roads.query import LaneQuery
 
 WINDOW = 0.5  # s over which accelerations and jerks are means
@@ -53,7 +53,7 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         for agent in agent_indices
         if trace.kind[agent] <= AgentKind.BICYCLE
     }
-    acceleration, jerk, within_limits = _peak_effort(trace, models)
+    acceleration, jerk, within_limits = _peak_effort(trace, models, proposal.scenario.friction)
     return Outcome(
         proposal,
         trace=trace,
@@ -117,7 +117,9 @@ def _hits_others(trace: EpisodeTrace, box: F64, agent: int) -> bool:
     return False
 
 
-def _peak_effort(trace: EpisodeTrace, models: Mapping[int, Model]) -> tuple[float | None, float | None, bool | None]:
+def _peak_effort(
+    trace: EpisodeTrace, models: Mapping[int, Model], friction: float
+) -> tuple[float | None, float | None, bool | None]:
     """Return the largest acceleration m/s^2 and jerk m/s^3 of vehicles, and whether all respected their limits."""
     lag = max(1, round(WINDOW / trace.dt))
     max_acceleration, max_jerk, within_limits = 0.0, 0.0, True
@@ -128,6 +130,7 @@ def _peak_effort(trace: EpisodeTrace, models: Mapping[int, Model]) -> tuple[floa
         if len(speed) <= lag:
             continue
         efforts = True
+        max_accel, max_brake = acceleration_limits(body, friction)
         longitudinal = (speed[lag:] - speed[:-lag]) / (lag * trace.dt)
         yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[present_rows, agent].astype(np.float64)))) / trace.dt
         lateral = np.abs(np.convolve(speed[1:] * yaw_rate, np.ones(lag) / lag, mode="valid"))
@@ -135,9 +138,9 @@ def _peak_effort(trace: EpisodeTrace, models: Mapping[int, Model]) -> tuple[floa
         max_acceleration = max(max_acceleration, float(np.abs(longitudinal).max()), float(lateral.max()))
         max_jerk = max(max_jerk, float(jerk.max(initial=0.0)))
         within_limits &= bool(
-            longitudinal.max() <= TOLERANCE * body.max_accel
-            and longitudinal.min() >= -TOLERANCE * body.max_brake
-            and lateral.max() <= TOLERANCE * GRIP
+            longitudinal.max() <= TOLERANCE * max_accel
+            and longitudinal.min() >= -TOLERANCE * max_brake
+            and lateral.max() <= TOLERANCE * lateral_grip(friction)
             and jerk.max(initial=0.0) <= TOLERANCE * MAX_JERK
         )
     return (max_acceleration, max_jerk, within_limits) if efforts else (None, None, None)

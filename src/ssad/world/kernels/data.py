@@ -127,6 +127,11 @@ class EpisodeArrays:
     model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot
     controller: wp.array2d(dtype=wp.int32)  # [E, A] Controller at the start
     start: wp.array2d(dtype=wp.vec4)  # [E, A] x, y, yaw, speed
+    # [E, A] driver: time gap s (0: the parameters that all Autopilots have), gap at rest m, acceleration, deceleration
+    style: wp.array2d(dtype=wp.vec4)
+    # [E, A] driver: desired speed over the limit, jerk m/s^3, reaction time s, estimation error
+    manner: wp.array2d(dtype=wp.vec4)
+    habit: wp.array2d(dtype=wp.vec3)  # [E, A] driver: place left of the lane's middle m, errors an hour, key
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
@@ -197,6 +202,8 @@ class State:
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
+    # [B, A] of a driver of the population: s for which it has not reacted yet, and its reaction to others, m/s^2
+    pending: wp.array2d(dtype=wp.vec2)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
     lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
     touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent
@@ -299,6 +306,8 @@ class Work:
     pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)
     # [B, A] whom an Autopilot follows: gap in cm * LEADERS + row of `PerceivedAgents`, or NO_LEADER
     leader: wp.array2d(dtype=wp.int32)
+    # [B, A] factor of the gaps that a driver judges, and 1 while it makes an error (late, and blind to priority)
+    judgement: wp.array2d(dtype=wp.vec2)
 
 
 def array_types(struct: Any) -> dict[str, Any]:

@@ -18,8 +18,24 @@ from ssad.world.kernels.data import (
     ScriptMotion,
     State,
 )
+from ssad.world.kernels.drivers import (
+    FIRM,
+    HARDEST,
+    NOTICES,
+    delay,
+    driver_accelerates,
+    is_lapsed,
+    lane_place,
+    pedal_change,
+)
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
+
+HALTED = wp.constant(0.1)  # m/s
+NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
+STARTS = wp.constant(0.15)  # m/s^2: for less nobody starts
+SHOCK = wp.constant(2.0)  # m/s^2 of it to which also one who brakes has to react
+EASES = wp.constant(0.4)  # m/s^2 of braking at the very end of a stop
 
 
 @wp.func
@@ -32,8 +48,13 @@ def idm_free(v: float, target: float) -> float:
 
 
 @wp.func
-def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, v: float) -> float:
-    """Return steering in [-1, 1]: the route's curvature slightly ahead, corrected critically damped in distance."""
+def steer_on_route(
+    bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, v: float, aside: float
+) -> float:
+    """Return steering in [-1, 1]: the route's curvature slightly ahead, corrected critically damped in distance.
+
+    aside: m left of the route on which to drive.
+    """
     route = bank.route[e, i]
     at = state.progress[b, i]
     point = row(roads.path, route[0] + at)
@@ -43,7 +64,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     dx = pose[0] - point[0]
     dy = pose[1] - point[1]
     offset = c * dx + s * dy
-    lateral = c * dy - s * dx - 0.5 * point[3] * offset * offset
+    lateral = c * dy - s * dx - 0.5 * point[3] * offset * offset - aside
     # In reverse nothing is previewed.
     forward_speed = wp.max(v, 0.0)
     reference = wp.clamp(at + int(wp.floor(offset + 0.15 * forward_speed + 0.5)), 0, route[1] - 1)
@@ -70,6 +91,47 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     slip_sine = wp.clamp(0.5 * curvature * body[2], -0.95, 0.95)
     wheel = wp.atan(2.0 * slip_sine / wp.sqrt(1.0 - slip_sine * slip_sine))
     return wp.clamp(wheel / wp.max(body[3], 1.0e-3), -1.0, 1.0)
+
+
+@wp.func
+def driven_acceleration(
+    bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, style: wp.vec4, dt: float
+) -> float:
+    """Return the acceleration to which a driver of the population comes in this step, m/s^2."""
+    speed = state.speed[b, i]
+    manner = bank.manner[e, i]
+    last = state.accel[b, i]
+    pending = state.pending[b, i][0]
+    # predictions flicker from step to step: a driver sees them as one
+    reaction = state.pending[b, i][1]
+    reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
+    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + reaction)
+    junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
+    if speed < HALTED:
+        if demand <= STARTS:
+            pending = 0.0
+            demand = wp.min(demand, -STARTS)
+        elif pending < manner[2]:
+            pending = pending + dt
+            demand = -style[3]
+    elif demand < last - NOTICED and (last > -NOTICED or demand < last - SHOCK):
+        # the foot leaves the throttle at once, and then reaches the brake
+        if pending < delay(manner[2], speed, junction):
+            pending = pending + dt
+            demand = wp.min(last, 0.0)
+    else:
+        pending = 0.0
+    if speed > HALTED and is_lapsed(bank.habit[e, i], float(state.step[b]) * dt):
+        demand = wp.max(demand, last)
+    state.pending[b, i] = wp.vec2(pending, reaction)
+    if speed < 1.5 and demand > -FIRM:
+        demand = wp.max(demand, -EASES - speed)  # comes to rest without a jolt
+    accel = pedal_change(demand, last, manner[1], dt)
+    if speed < HALTED and demand <= 0.0:
+        accel = demand
+    if speed < 0.0:
+        accel = -style[3]  # the brake ends a way back
+    return accel
 
 
 @wp.func
@@ -131,9 +193,16 @@ def drive_one(
     elif controller == Controller.AUTOPILOT or controller == Controller.FOLLOW:
         steer = float(0.0)
         accel = float(0.0)
+        style = bank.style[e, i]
+        has_driver = controller == Controller.AUTOPILOT and style[0] > 0.0
         if bank.route[e, i][1] > 1:
-            steer = steer_on_route(bank, roads, state, b, i, e, speed)
-        if controller == Controller.AUTOPILOT:
+            aside = float(0.0)
+            if has_driver:
+                aside = lane_place(bank.habit[e, i], float(state.step[b]) * dt)
+            steer = steer_on_route(bank, roads, state, b, i, e, speed, aside)
+        if has_driver:
+            accel = driven_acceleration(bank, roads, state, b, i, e, style, dt)
+        elif controller == Controller.AUTOPILOT:
             free = idm_free(speed, state.aim[b, i][1])
             accel = wp.min(free, state.react[b, i])
             if free > 0.0:

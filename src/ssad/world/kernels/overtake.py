@@ -24,7 +24,7 @@ from ssad.world.kernels.data import (
 )
 from ssad.world.kernels.lanes import lanes_left, metres_left, on_oncoming_lane, way_frame
 from ssad.world.kernels.shared import boxes_touch, route_frame, row
-from ssad.world.kernels.traffic import idm_gap, line_ahead
+from ssad.world.kernels.traffic import idm_gap, line_ahead, stop_before
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -351,7 +351,7 @@ def choose_lane(
         elif must_return and not oncoming:
             stop = leads_on - own_body[0] - shortest
             if stop < 4.0 * speed + 20.0:
-                state.react[b, i] = wp.min(state.react[b, i], idm_gap(speed, 0.0, stop))
+                state.react[b, i] = wp.min(state.react[b, i], stop_before(speed, stop, bank.style[e, i]))
         return
 
     j = leader % LEADERS
@@ -429,7 +429,8 @@ def choose_lane(
                 elif stands and speed < 0.3:
                     state.stalled[b, i] = 1  # too near to pull out
     if stands and wants and not decided:
-        state.react[b, i] = wp.min(state.react[b, i], idm_gap(speed, 0.0, wp.max(gap - PULL_OUT, 0.1)))
+        reaction = stop_before(speed, wp.max(gap - PULL_OUT, 0.1), bank.style[e, i])
+        state.react[b, i] = wp.min(state.react[b, i], reaction)
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)

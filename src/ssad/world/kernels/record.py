@@ -264,6 +264,7 @@ def reset_agent(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int)
     state.lane[b, i] = -1
     state.aim[b, i] = wp.vec2(0.0, 0.0)
     state.react[b, i] = 0.0
+    state.pending[b, i] = wp.vec2(0.0, 0.0)
     presence = int(Presence.AWAKE)
     if bank.model[e, i] < 0:
         presence = Presence.ABSENT

@@ -881,7 +881,7 @@ def run_one(
         if bank.script[episode, agent][3] == ScriptMotion.RAIL:
             pose = advance_on_rail(bank, roads, scripts, state, script, scene, agent, speed, dt)
         elif bank.route[episode, agent][1] > 1:
-            steer = steer_on_route(bank, roads, state, scene, agent, episode, current)
+            steer = steer_on_route(bank, roads, state, scene, agent, episode, current, 0.0)
         script.goal[scene, agent] = wp.vec4(pose[0], pose[1], pose[2], speed)
         # pedals for whoever shows or mirrors the agent; here it moves by its goal
         acceleration = (speed - current) / dt

@@ -8,7 +8,7 @@ predicted conflict that it must yield to (here).
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller, SignalState
-from ssad.world.kernels.belief import light
+from ssad.world.kernels.belief import extend_box, light
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
@@ -26,6 +26,16 @@ from ssad.world.kernels.data import (
     Work,
 )
 from ssad.world.kernels.drive import room_behind
+from ssad.world.kernels.drivers import (
+    RUNS_RED,
+    STOPS_AT_YELLOW,
+    driver_follows,
+    driver_speed,
+    driver_stops,
+    driver_yields,
+    is_lapsed,
+    judged_share,
+)
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
 from ssad.world.kernels.shared import (
     BRIDGE,
@@ -43,6 +53,7 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+FAR_SIGHT = wp.constant(120.0)  # m, of drivers of the population
 FAST = wp.constant(27.0)  # m/s: who aims for more than any town's limit looks as far as it needs to stop gently
 SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per squared speed
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
@@ -50,6 +61,10 @@ NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
+APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
+LONGER = wp.constant(6)  # strides beyond the forecast
+RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
+PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
 
 @wp.func
@@ -68,6 +83,22 @@ def idm_gap(v: float, lead: float, gap: float) -> float:
     desired_gap = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + closing_term)
     ratio = desired_gap / wp.max(gap, 0.1)
     return -IDM_ACCEL * ratio * ratio
+
+
+@wp.func
+def follow(v: float, lead: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a leader; style: see `EpisodeArrays`."""
+    if style[0] > 0.0:
+        return driver_follows(v, lead, gap, style)
+    return idm_gap(v, lead, gap)
+
+
+@wp.func
+def stop_before(v: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a place `gap` metres ahead before which one stops."""
+    if style[0] > 0.0:
+        return driver_stops(v, gap, style)
+    return idm_gap(v, 0.0, gap)
 
 
 @wp.func
@@ -282,6 +313,28 @@ def has_priority(
 
 
 @wp.func
+def looks_longer(rule: wp.vec4, offset: float, half: float, speed: float, style: wp.vec4) -> int:
+    """Return the strides beyond the forecast that a driver of the population looks ahead: before it crosses traffic."""
+    front = rule[2] - offset - half
+    crosses = int(rule[3]) != int(TurnRank.STRAIGHT) or speed < 3.0
+    extra = int(0)
+    if style[0] > 0.0 and rule[2] > 0.0 and front < APPROACH and crosses:
+        extra = LONGER
+    return extra
+
+
+@wp.func
+def forecast_pose(perceived: PerceivedAgents, b: int, j: int, index: int) -> wp.vec3:
+    """Return the pose of an agent `index` + 1 strides ahead; beyond its forecast it goes straight on."""
+    if index < HORIZON:
+        return perceived.forecast[b, j, index]
+    last = perceived.forecast[b, j, HORIZON - 1]
+    previous = perceived.forecast[b, j, HORIZON - 2]
+    strides = float(index - HORIZON + 1)
+    return wp.vec3(last[0] + strides * (last[0] - previous[0]), last[1] + strides * (last[1] - previous[1]), last[2])
+
+
+@wp.func
 def conflict_gap(
     roads: Roads,
     perceived: PerceivedAgents,
@@ -295,14 +348,18 @@ def conflict_gap(
     own_body: wp.vec4,
     other_body: wp.vec2,
     lat_margin: float,
-) -> float:
-    """Return the distance from i's front bumper to its predicted conflict with j within 4 s, or FAR.
+    pace: float,
+    pick_up: float,
+    extra: int,
+) -> wp.vec2:
+    """Return the distance from i's front bumper to its predicted conflict with j, or FAR, and the time until then, s.
 
     i is predicted along its intention, j along its own route at constant speed (along its heading if it has none);
     they are compared at the same time and half a second to either side. The distance is to the near edge of the
     conflict.
     """
     gap = FAR
+    first_time = FAR
     along = float(0.0)
     speed = v
     # Long enough that a fast, short agent does not skip from before the path to behind it.
@@ -311,19 +368,20 @@ def conflict_gap(
     squared_reach = reach * reach
     before = perceived.pose[b, j]
     now = perceived.forecast[b, j, 0]
-    for step in range(HORIZON):
+    strides = int(HORIZON) + extra
+    for step in range(strides):
         # it slows down for bends as the route's speed profile says
         route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
         next_speed = wp.min(
-            speed + 2.0 * STRIDE,
-            wp.min(wp.max(target, speed), wp.max(roads.rule[route_point][0], speed - 4.0 * STRIDE)),
+            speed + pick_up * STRIDE,
+            wp.min(wp.max(target, speed), wp.max(pace * roads.rule[route_point][0], speed - 4.0 * STRIDE)),
         )
         along = along + 0.5 * (speed + next_speed) * STRIDE
         speed = next_speed
         frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         later = now
-        if step + 1 < HORIZON:
-            later = perceived.forecast[b, j, step + 1]
+        if step + 1 < strides:
+            later = forecast_pose(perceived, b, j, step + 1)
         for moment in range(3):
             other_pose = now
             if moment == 0:
@@ -349,16 +407,14 @@ def conflict_gap(
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
+                        first_time = wp.min(first_time, STRIDE * float(step))
         before = now
         now = later
-    return gap
+    return wp.vec2(gap, first_time)
 
 
 @wp.func
 def cannot_meet(
-    perceived: PerceivedAgents,
-    b: int,
-    j: int,
     pose: wp.vec3,
     c: float,
     s: float,
@@ -366,12 +422,13 @@ def cannot_meet(
     lat: float,
     ahead: float,
     off: float,
+    last_pose: wp.vec3,
 ) -> bool:
-    """Return whether j's next 4 s cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
+    """Return whether j's next seconds cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
 
-    lon, lat: place of j now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
+    last_pose: j's last one;
+    lon, lat: its place now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
     """
-    last_pose = perceived.forecast[b, j, HORIZON - 1]
     dx = last_pose[0] - pose[0]
     dy = last_pose[1] - pose[1]
     last_lon = dx * c + dy * s
@@ -408,13 +465,25 @@ def scan_agents(
     own_body = bank.body[bank.model[e, i]]
     point = row(roads.path, first)
     offset = (pose[0] - point[0]) * wp.cos(point[2]) + (pose[1] - point[1]) * wp.sin(point[2])
+    style = bank.style[e, i]
     speed_cap = wp.min(road_rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
+    if style[0] > 0.0:
+        time = float(state.step[b]) * dt
+        manner = bank.manner[e, i]
+        habit = bank.habit[e, i]
+        speed_cap = driver_speed(roads, route, at, speed, manner[0], style[3])
+        blind = float(0.0)
+        if is_lapsed(habit, time):
+            blind = 1.0
+        work.judgement[b, i] = wp.vec2(judged_share(manner, habit, time), blind)
     shift = state.shift[b, i]
     target = wp.min(wp.min(state.cruise[b, i], speed_cap), change_speed(shift, float(at) + offset))
     state.aim[b, i] = wp.vec2(float(at) + offset, target)
     react = float(0.0)
 
     sight = sight_range(state.cruise[b, i])
+    if style[0] > 0.0:
+        sight = wp.max(sight, FAR_SIGHT)
     signal_index = roads.path_signal[first]
     signal_now = int(SignalState.OFF)
     if signal_index >= 0 and road_rule[1] - offset < sight + 40.0:
@@ -423,13 +492,17 @@ def scan_agents(
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
-            react = idm_gap(speed, 0.0, line_gap + 1.0)
+            react = stop_before(speed, line_gap + 1.0, style)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
+                if style[0] > 0.0:
+                    stop = speed * speed < 2.0 * STOPS_AT_YELLOW * wp.max(line_gap, 0.5)
+            elif style[0] > 0.0 and speed > 4.0 and speed * speed > 2.0 * RUNS_RED * wp.max(line_gap, 0.5):
+                stop = False  # the decision to go was made at yellow
             if (
                 signal_now == SignalState.RED
                 and int(road_rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
@@ -438,7 +511,7 @@ def scan_agents(
             ):
                 stop = False  # turn to the near side on red, after a stop, where allowed; it yields below
             if stop:
-                react = wp.min(react, idm_gap(speed, 0.0, line_gap + 1.0))
+                react = wp.min(react, stop_before(speed, line_gap + 1.0, style))
     state.react[b, i] = react
     state.stalled[b, i] = 0
     work.leader[b, i] = NO_LEADER
@@ -446,9 +519,10 @@ def scan_agents(
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     # Range within which agents matter: 4 s of driving, and the distance of comfortable braking.
-    travel = wp.max(target, speed) * STRIDE * float(HORIZON)
+    extra = looks_longer(road_rule, offset, own_body[0], speed, style)
+    travel = wp.max(target, speed) * STRIDE * float(HORIZON + extra)
     view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), sight)
-    if sight > SIGHT:
+    if sight > SIGHT and style[0] == 0.0:
         view_range = wp.min(wp.max(view_range, SIGHT_SHARE * speed * speed), sight)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
@@ -474,6 +548,10 @@ def scan_agents(
     for j in range(from_row, to_row):
         if j != i and perceived.kind[b, j] != AgentKind.NONE:
             box = perceived.span[b, j]
+            last_pose = perceived.forecast[b, j, HORIZON - 1]
+            if extra > 0:
+                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
+                box = extend_box(box, last_pose)
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
                 other_half = perceived.half[b, j]
                 other_pose = perceived.pose[b, j]
@@ -503,7 +581,7 @@ def scan_agents(
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own_body[0] + other_half[0] + 2.0
                     if not cannot_meet(
-                        perceived, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
+                        pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach, last_pose
                     ):
                         flags = flags + 2
                 if flags > 0 and wp.abs(perceived.height[b, j] - perceived.height[b, i]) > BRIDGE:
@@ -572,6 +650,10 @@ def react_to_agents(
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
+        style = bank.style[e, i]
+        judgement = wp.vec2(1.0, 0.0)
+        if style[0] > 0.0:
+            judgement = work.judgement[b, i]
         first = route[0] + state.progress[b, i]
         offset = aim[0] - float(state.progress[b, i])
         line = line_ahead(roads, first, offset, own_body[0])
@@ -592,6 +674,8 @@ def react_to_agents(
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
             sight = sight_range(state.cruise[b, i])
+            if style[0] > 0.0:
+                sight = wp.max(sight, FAR_SIGHT)
             leader = lead_gap(
                 roads,
                 perceived,
@@ -609,7 +693,7 @@ def react_to_agents(
                 sight,
             )
             if leader[0] < FAR:
-                react = idm_gap(speed, wp.max(leader[1], 0.0), leader[0])
+                react = follow(speed, wp.max(leader[1], 0.0), judgement[0] * leader[0], style)
                 wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, sight)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
@@ -633,18 +717,56 @@ def react_to_agents(
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
-                if line > -1.0 and leader[0] > line + 3.0 and leader[0] < required_room and leader[1] < 1.5:
-                    react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
+                # a driver of the population does not brake hard for it
+                late = style[0] > 0.0 and speed * speed > 3.0 * style[3] * (wp.max(line, 0.0) + 0.5)
+                if (
+                    line > -1.0
+                    and leader[0] > line + 3.0
+                    and leader[0] < required_room
+                    and leader[1] < 1.5
+                    and not late
+                ):
+                    if style[0] > 0.0:
+                        react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
+                    else:
+                        react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
         if flags >= 2 and leads == 0:
             margin = 0.4
             if walks:
                 margin = 1.0
-            gap = conflict_gap(
-                roads, perceived, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin
+            pick_up = float(PICKS_UP)
+            if style[0] > 0.0:
+                pick_up = 0.8 * style[2]
+            conflict = conflict_gap(
+                roads,
+                perceived,
+                b,
+                j,
+                route,
+                shift,
+                aim[0],
+                speed,
+                aim[1],
+                own_body,
+                other_half,
+                margin,
+                bank.manner[e, i][0],
+                pick_up,
+                looks_longer(row(roads.rule, first), offset, own_body[0], speed, style),
             )
+            gap = conflict[0]
             if gap < FAR:
+                near = 0.5 * speed
+                if style[0] > 0.0:
+                    # who has priority relies on the other one as long as that one can stop
+                    other_speed = wp.abs(perceived.speed[b, j])
+                    if other_speed * (conflict[1] - other_speed / (2.0 * RELIES)) < 0.5:
+                        near = FAR
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first)
+                at_line = bool(False)
+                if judgement[1] > 0.0:
+                    goes_first = True  # an error: it does not look who has priority
                 if not goes_first and line > -1.0 and not walks and speed * speed < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
@@ -654,10 +776,19 @@ def react_to_agents(
                     entered = is_in_junction(perceived, b, j)
                     crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
                     if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
-                        gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
+                        at_line = wp.max(line, 0.0) + 1.0 < gap
+                        if style[0] > 0.0 and speed * speed > 3.0 * style[3] * (line + 0.5):
+                            at_line = bool(False)  # rolls beyond the line: stops where the conflict is
+                        else:
+                            gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < 0.5 * speed and wp.abs(perceived.speed[b, j]) > STANDS):
-                    react = wp.min(react, idm_gap(speed, 0.0, gap))
+                if not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS):
+                    if at_line and style[0] > 0.0:
+                        react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
+                    elif style[0] > 0.0:
+                        react = wp.min(react, driver_yields(speed, gap, style))
+                    else:
+                        react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)
         slot = slot + workers

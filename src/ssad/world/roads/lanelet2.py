@@ -181,7 +181,7 @@ class _Reader:
             )
         if len(lanelet_elements) > MAX_LANELETS:
             self.fail("<osm>", f"{len(lanelet_elements)} lanelets, at most {MAX_LANELETS}")
-        self.point_rows = {name: row for row, name in enumerate(self.ids(elements["node"]))}
+        self.point_rows = {element_id: row for row, element_id in enumerate(self.ids(elements["node"]))}
         self.ways = self.read_ways(elements["way"])
         self.ids(elements["relation"])
         rules = {}
@@ -209,7 +209,11 @@ class _Reader:
             self.fail("<osm>", "no lanelet in it has a shape")
         self.check_rules(lanelets, rules)
         lanelet_ways = frozenset(
-            name for roles in members for role, names in roles.items() if role != "regulatory_element" for name in names
+            element_id
+            for roles in members
+            for role, element_ids in roles.items()
+            if role != "regulatory_element"
+            for element_id in element_ids
         )
         return LaneletMap(self.xyz, tuple(lanelets), rules, self.ways, origin, lanelet_ways)
 
@@ -235,24 +239,24 @@ class _Reader:
         return present
 
     def ids(self, elements: list[Element]) -> list[str]:
-        names = [element.get("id", "") for element in elements]
-        repeated = [name for name, count in Counter(names).items() if count > 1]
+        element_ids = [element.get("id", "") for element in elements]
+        repeated = [element_id for element_id, count in Counter(element_ids).items() if count > 1]
         if repeated:
             self.fail(f"{elements[0].tag} {repeated[0][:30]}", f"two {elements[0].tag}s have this id")
-        return names
+        return element_ids
 
     def read_ways(self, elements: list[Element]) -> dict[str, Way]:
         ways = {}
-        for name, element in zip(self.ids(elements), elements, strict=True):
-            rows: list[int] = []
+        for element_id, element in zip(self.ids(elements), elements, strict=True):
+            point_rows: list[int] = []
             for reference in element.iterfind("nd"):
                 row = self.point_rows.get(reference.get("ref", ""))
                 if row is None:
-                    place = f"way {name[:30]}, node {reference.get('ref', '')[:30]}"
+                    place = f"way {element_id[:30]}, node {reference.get('ref', '')[:30]}"
                     self.report.doubt("a line refers to a point that the map lacks", place)
-                elif not rows or rows[-1] != row:
-                    rows.append(row)
-            ways[name] = Way(name, tuple(rows), _tags(element))
+                elif not point_rows or point_rows[-1] != row:
+                    point_rows.append(row)
+            ways[element_id] = Way(element_id, tuple(point_rows), _tags(element))
         return ways
 
     def rule(self, element: Element, tags: Tags) -> Rule:
@@ -260,17 +264,17 @@ class _Reader:
 
     def used_points(self, members: list[dict[str, tuple[str, ...]]]) -> Index:
         """Return the rows of the points of all bounds, sorted."""
-        rows = {
+        point_rows = {
             row
             for roles in members
             for role in ("left", "right", "centerline")
-            for name in roles.get(role, ())
-            if name in self.ways
-            for row in self.ways[name].points
+            for element_id in roles.get(role, ())
+            if element_id in self.ways
+            for row in self.ways[element_id].points
         }
-        if not rows:
+        if not point_rows:
             self.fail("<osm>", "no lanelet in it has a bound with points")
-        return np.array(sorted(rows))
+        return np.array(sorted(point_rows))
 
     # ------------------------------------------------------------ coordinates
 
@@ -288,10 +292,10 @@ class _Reader:
 
     def coordinates(self, nodes: list[Element], used: Index) -> tuple[F64, tuple[float, float]]:
         """Return the points [P, 3] in the town's coordinates, and the origin of these."""
-        rows = []
+        point_rows = []
         for node in nodes:
             tags, place = _tags(node), f"node {_name(node)}"
-            rows.append(
+            point_rows.append(
                 (
                     self.number(node.get("lat"), f"{place}, lat", 90.0),
                     self.number(node.get("lon"), f"{place}, lon", 540.0),
@@ -300,7 +304,7 @@ class _Reader:
                     self.number(tags.get("ele"), f"{place}, ele", MAX_HEIGHT),
                 )
             )
-        table = np.array(rows, np.float64).reshape(-1, 5)
+        table = np.array(point_rows, np.float64).reshape(-1, 5)
         height = table[:, 4]
         without_height = int(np.isnan(height[used]).sum())
         if 0 < without_height < len(used):
@@ -311,7 +315,7 @@ class _Reader:
             self.fail("<osm>", f"its lanelets lie {extent:.0f} m from their middle, the limit is {MAX_EXTENT:.0f} m")
         return np.column_stack([xy, np.nan_to_num(height)]), origin
 
-    def plane(self, table: F64, used: Index, names: list[str]) -> tuple[F64, tuple[float, float]]:
+    def plane(self, table: F64, used: Index, element_ids: list[str]) -> tuple[F64, tuple[float, float]]:
         """Return x and y of the points, and the origin of these."""
         has_local = np.isfinite(table[used, 2:4]).all(1)
         is_asked = self.options.origin is not None or self.options.projection is not None
@@ -325,7 +329,7 @@ class _Reader:
         has_place = np.isfinite(table[used, :2]).all(1)
         if not has_place.all():
             row = int(used[np.flatnonzero(~has_place)[0]])
-            self.fail(f"node {names[row]}", "it has neither latitude and longitude nor local_x and local_y")
+            self.fail(f"node {element_ids[row]}", "it has neither latitude and longitude nor local_x and local_y")
         if has_local.any() and not is_asked:
             self.report.doubt(
                 "only some points have local_x and local_y; latitude and longitude are used", count=int(has_local.sum())
@@ -370,80 +374,80 @@ class _Reader:
         place = f"lanelet {_name(element)}"
         lines = []
         for side in ("left", "right"):
-            names = roles.get(side, ())
-            missing = [name for name in names if name not in self.ways]
-            if not names or missing:
+            element_ids = roles.get(side, ())
+            missing = [element_id for element_id in element_ids if element_id not in self.ways]
+            if not element_ids or missing:
                 reason = "a lanelet refers to a line that the map lacks" if missing else "a lanelet lacks a bound"
                 self.report.doubt(f"{reason}; it is left out", place)
                 return None
-            rows = self.chain([self.ways[name] for name in names])
-            if rows is None:
+            point_rows = self.chain([self.ways[element_id] for element_id in element_ids])
+            if point_rows is None:
                 self.report.doubt("the lines of a bound do not join; the lanelet is left out", place)
                 return None
-            if len(rows) < 2 or _extent(self.xyz[list(rows)]) < SAME_PLACE:
+            if len(point_rows) < 2 or _extent(self.xyz[list(point_rows)]) < SAME_PLACE:
                 self.report.doubt("a bound has fewer than two points; the lanelet is left out", place)
                 return None
-            lines.append((rows, self.ways[names[0]].tags))
+            lines.append((point_rows, self.ways[element_ids[0]].tags))
         (left, left_tags), (right, right_tags) = lines
         turn_left, turn_right = directions(self.xyz[list(left), :2], self.xyz[list(right), :2])
         bounds = [
-            Bound(rows[::-1] if turned else rows, bound_tags, turned)
-            for rows, bound_tags, turned in ((left, left_tags, turn_left), (right, right_tags, turn_right))
+            Bound(point_rows[::-1] if turned else point_rows, bound_tags, turned)
+            for point_rows, bound_tags, turned in ((left, left_tags, turn_left), (right, right_tags, turn_right))
         ]
         centre = self.centre(roles.get("centerline", ()), bounds, place)
-        for role, names in roles.items():
+        for role, element_ids in roles.items():
             if role not in ("left", "right", "centerline", "regulatory_element"):
-                self.report.omit(f"members of lanelets in the role '{role[:30]}'", place, count=len(names))
+                self.report.omit(f"members of lanelets in the role '{role[:30]}'", place, count=len(element_ids))
         return Lanelet(element.get("id", ""), bounds[0], bounds[1], tags, roles.get("regulatory_element", ()), centre)
 
     def chain(self, ways: list[Way]) -> tuple[int, ...] | None:
         """Return the points of lines that follow each other, in the direction of the first; None if they do not."""
-        rows = [self.same[row] for row in ways[0].points]
+        point_rows = [self.same[row] for row in ways[0].points]
         for way in ways[1:]:
             following = [self.same[row] for row in way.points]
-            if not rows or not following:
+            if not point_rows or not following:
                 return None
-            if following[0] != rows[-1] and following[-1] == rows[-1]:
+            if following[0] != point_rows[-1] and following[-1] == point_rows[-1]:
                 following.reverse()
-            elif following[0] != rows[-1] and rows[0] in (following[0], following[-1]):
-                rows.reverse()
-                if following[0] != rows[-1]:
+            elif following[0] != point_rows[-1] and point_rows[0] in (following[0], following[-1]):
+                point_rows.reverse()
+                if following[0] != point_rows[-1]:
                     following.reverse()
-            if following[0] != rows[-1]:
+            if following[0] != point_rows[-1]:
                 return None
-            rows += following[1:]
-        return tuple(row for index, row in enumerate(rows) if not index or row != rows[index - 1])
+            point_rows += following[1:]
+        return tuple(row for index, row in enumerate(point_rows) if not index or row != point_rows[index - 1])
 
-    def centre(self, names: tuple[str, ...], bounds: list[Bound], place: str) -> tuple[int, ...]:
+    def centre(self, element_ids: tuple[str, ...], bounds: list[Bound], place: str) -> tuple[int, ...]:
         """Return the points of the centre line that the file gives, if it leads from one end to the other."""
-        if len(names) != 1 or names[0] not in self.ways:
-            if names:
+        if len(element_ids) != 1 or element_ids[0] not in self.ways:
+            if element_ids:
                 self.report.doubt("the centre line of a lanelet is not one line of the map", place)
             return ()
-        rows = tuple(self.same[row] for row in self.ways[names[0]].points)
-        if len(rows) < 2:
+        point_rows = tuple(self.same[row] for row in self.ways[element_ids[0]].points)
+        if len(point_rows) < 2:
             self.report.doubt("the centre line of a lanelet has fewer than two points", place)
             return ()
         start, end = (
             0.5 * (self.xyz[bounds[0].points[index], :2] + self.xyz[bounds[1].points[index], :2]) for index in (0, -1)
         )
-        first, last = self.xyz[rows[0], :2], self.xyz[rows[-1], :2]
+        first, last = self.xyz[point_rows[0], :2], self.xyz[point_rows[-1], :2]
         if math.dist(first, start) + math.dist(last, end) > math.dist(first, end) + math.dist(last, start):
-            rows, first, last = rows[::-1], last, first
+            point_rows, first, last = point_rows[::-1], last, first
         half_width = 0.5 * max(
             math.dist(self.xyz[bounds[0].points[index], :2], self.xyz[bounds[1].points[index], :2]) for index in (0, -1)
         )
         if max(math.dist(first, start), math.dist(last, end)) > half_width:
             self.report.doubt("the centre line of a lanelet does not reach its ends; the middle is taken", place)
             return ()
-        return rows
+        return point_rows
 
     def check_rules(self, lanelets: list[Lanelet], rules: Mapping[str, Rule]) -> None:
         """Doubt references to regulatory elements that are missing."""
         for lanelet in lanelets:
-            for name in lanelet.rules:
-                if name not in rules:
-                    place = f"lanelet {lanelet.id[:30]}, relation {name[:30]}"
+            for element_id in lanelet.rules:
+                if element_id not in rules:
+                    place = f"lanelet {lanelet.id[:30]}, relation {element_id[:30]}"
                     self.report.doubt("a lanelet refers to a regulatory element that the map lacks", place)
 
 
@@ -513,7 +517,7 @@ def _members(element: Element) -> dict[str, tuple[str, ...]]:
     roles: dict[str, list[str]] = {}
     for member in element.iterfind("member"):
         roles.setdefault(member.get("role", ""), []).append(member.get("ref", ""))
-    return {role: tuple(names) for role, names in roles.items()}
+    return {role: tuple(element_ids) for role, element_ids in roles.items()}
 
 
 def _name(element: Element) -> str:

@@ -56,12 +56,12 @@ class LaneletLanes:
         self.crosswalks: list[F64] = []
         self.lines: list[F64] = []
         self._sort_lanelets()
-        self.row_of = {lanelet.id: row for row, lanelet in enumerate(self.lanelets)}
+        self.row_of = {lanelet.id: lane_index for lane_index, lanelet in enumerate(self.lanelets)}
         self.successors = self._links()
         self.predecessors: list[list[int]] = [[] for _ in self.lanelets]
-        for row, followers in enumerate(self.successors):
+        for lane_index, followers in enumerate(self.successors):
             for follower in followers:
-                self.predecessors[follower].append(row)
+                self.predecessors[follower].append(lane_index)
         self._smooth_headings()
         self.oncoming = [0, 0]
         self.left, self.right, self.road, self.forward = self._neighbours()
@@ -69,9 +69,9 @@ class LaneletLanes:
         self.lane_id = self._lane_ids()
         self.junction = self._junctions()
 
-    def place(self, row: int) -> str:
+    def place(self, lane_index: int) -> str:
         """Return the name of a lane in the file."""
-        return f"lanelet {self.lanelets[row].id[:30]}"
+        return f"lanelet {self.lanelets[lane_index].id[:30]}"
 
     # ------------------------------------------------------------ shapes
 
@@ -129,15 +129,17 @@ class LaneletLanes:
     def _links(self) -> list[list[int]]:
         """Return the lanes that begin at the points at which each lane ends."""
         starts: dict[tuple[int, int, LaneType], list[int]] = defaultdict(list)
-        for row, lanelet in enumerate(self.lanelets):
-            starts[lanelet.left.points[0], lanelet.right.points[0], self.kinds[row]].append(row)
+        for lane_index, lanelet in enumerate(self.lanelets):
+            starts[lanelet.left.points[0], lanelet.right.points[0], self.kinds[lane_index]].append(lane_index)
         return [
             [
-                other
-                for other in starts.get((lanelet.left.points[-1], lanelet.right.points[-1], self.kinds[row]), ())
-                if other != row
+                other_lane
+                for other_lane in starts.get(
+                    (lanelet.left.points[-1], lanelet.right.points[-1], self.kinds[lane_index]), ()
+                )
+                if other_lane != lane_index
             ]
-            for row, lanelet in enumerate(self.lanelets)
+            for lane_index, lanelet in enumerate(self.lanelets)
         ]
 
     def _neighbours(self) -> tuple[I32, I32, I32, Any]:
@@ -145,39 +147,41 @@ class LaneletLanes:
         count = len(self.lanelets)
         by_left: dict[tuple[int, ...], list[int]] = defaultdict(list)
         by_right: dict[tuple[int, ...], list[int]] = defaultdict(list)
-        for row, lanelet in enumerate(self.lanelets):
-            by_left[lanelet.left.points].append(row)
-            by_right[lanelet.right.points].append(row)
+        for lane_index, lanelet in enumerate(self.lanelets):
+            by_left[lanelet.left.points].append(lane_index)
+            by_right[lanelet.right.points].append(lane_index)
         sides = np.full((2, count), -1, np.int32)
         beside: list[list[tuple[int, int]]] = [[] for _ in range(count)]
-        for row, lanelet in enumerate(self.lanelets):
+        for lane_index, lanelet in enumerate(self.lanelets):
             for side, (points, same, opposite) in enumerate(
                 ((lanelet.left.points, by_right, by_left), (lanelet.right.points, by_left, by_right))
             ):
-                candidates = [(other, 1) for other in same.get(points, ()) if other != row]
-                candidates += [(other, -1) for other in opposite.get(points[::-1], ()) if other != row]
+                candidates = [(other_lane, 1) for other_lane in same.get(points, ()) if other_lane != lane_index]
+                candidates += [
+                    (other_lane, -1) for other_lane in opposite.get(points[::-1], ()) if other_lane != lane_index
+                ]
                 if not candidates:
                     continue
-                other, sign = min(
-                    candidates, key=lambda found: (self.kinds[found[0]] != self.kinds[row], -found[1], found[0])
+                other_lane, sign = min(
+                    candidates, key=lambda found: (self.kinds[found[0]] != self.kinds[lane_index], -found[1], found[0])
                 )
-                sides[side, row] = other
-                beside[row].append((other, sign))
-                beside[other].append((row, sign))
-                if sign < 0 and self.kinds[row] == self.kinds[other] == LaneType.DRIVING:
+                sides[side, lane_index] = other_lane
+                beside[lane_index].append((other_lane, sign))
+                beside[other_lane].append((lane_index, sign))
+                if sign < 0 and self.kinds[lane_index] == self.kinds[other_lane] == LaneType.DRIVING:
                     self.oncoming[side] += 1
         road, direction = np.full(count, -1, np.int32), np.ones(count, np.int32)
-        order = sorted(range(count), key=lambda row: (self.kinds[row] != LaneType.DRIVING, row))
+        order = sorted(range(count), key=lambda lane_index: (self.kinds[lane_index] != LaneType.DRIVING, lane_index))
         for number, root in enumerate(order):
             if road[root] >= 0:
                 continue
             road[root], pending = number, [root]
             while pending:
-                row = pending.pop()
-                for other, sign in beside[row]:
-                    if road[other] < 0:
-                        road[other], direction[other] = number, direction[row] * sign
-                        pending.append(other)
+                lane_index = pending.pop()
+                for other_lane, sign in beside[lane_index]:
+                    if road[other_lane] < 0:
+                        road[other_lane], direction[other_lane] = number, direction[lane_index] * sign
+                        pending.append(other_lane)
         return sides[0], sides[1], road, direction > 0
 
     def _keeps_left(self) -> bool:
@@ -205,27 +209,31 @@ class LaneletLanes:
         """Return ids as OpenDRIVE has them: from the middle of the road outwards, growing to the left of the road."""
         places = np.zeros(len(self.lanelets))
         lanes_by_road: dict[int, list[int]] = defaultdict(list)
-        for row, road in enumerate(self.road.tolist()):
-            lanes_by_road[road].append(row)
+        for lane_index, road in enumerate(self.road.tolist()):
+            lanes_by_road[road].append(lane_index)
         result = np.zeros(len(self.lanelets), np.int32)
         for lanes in lanes_by_road.values():
             members, visited, pending = set(lanes), {lanes[0]}, [lanes[0]]
             while pending:
-                row = pending.pop()
-                to_left = 1.0 if self.forward[row] else -1.0
-                for other, shift in ((int(self.left[row]), to_left), (int(self.right[row]), -to_left)):
-                    if other in members and other not in visited:
-                        visited.add(other)
-                        places[other] = places[row] + shift
-                        pending.append(other)
+                lane_index = pending.pop()
+                to_left = 1.0 if self.forward[lane_index] else -1.0
+                for other_lane, shift in (
+                    (int(self.left[lane_index]), to_left),
+                    (int(self.right[lane_index]), -to_left),
+                ):
+                    if other_lane in members and other_lane not in visited:
+                        visited.add(other_lane)
+                        places[other_lane] = places[lane_index] + shift
+                        pending.append(other_lane)
             for forward in (True, False):
                 # Lanes along the road lie on its right in right-hand traffic, and have negative ids there.
                 is_positive = forward == self.left_hand
                 rows = sorted(
-                    (row for row in lanes if self.forward[row] == forward), key=lambda row: (places[row], row)
+                    (lane_index for lane_index in lanes if self.forward[lane_index] == forward),
+                    key=lambda lane_index: (places[lane_index], lane_index),
                 )
-                for rank, row in enumerate(rows if is_positive else rows[::-1], 1):
-                    result[row] = rank if is_positive else -rank
+                for rank, lane_index in enumerate(rows if is_positive else rows[::-1], 1):
+                    result[lane_index] = rank if is_positive else -rank
         return result
 
     # ------------------------------------------------------------ junctions
@@ -236,66 +244,72 @@ class LaneletLanes:
         Lanelet2 has no junctions. Lanes for vehicles form one where they cross, or where short ones fork or merge, or
         where the map tags a turn; those that touch belong together.
         """
-        driving = [row for row, kind in enumerate(self.kinds) if kind == LaneType.DRIVING]
+        driving = [lane_index for lane_index, kind in enumerate(self.kinds) if kind == LaneType.DRIVING]
         pairs = list(self._crossings(driving))
-        members = {row for pair in pairs for row in pair}
+        members = {lane_index for pair in pairs for lane_index in pair}
         ends: dict[tuple[str, int, int], list[int]] = defaultdict(list)
         areas: dict[tuple[str, int, int] | str, list[int]] = defaultdict(list)
-        for row in driving:
-            lanelet = self.lanelets[row]
-            ends["start", lanelet.left.points[0], lanelet.right.points[0]].append(row)
-            ends["end", lanelet.left.points[-1], lanelet.right.points[-1]].append(row)
+        for lane_index in driving:
+            lanelet = self.lanelets[lane_index]
+            ends["start", lanelet.left.points[0], lanelet.right.points[0]].append(lane_index)
+            ends["end", lanelet.left.points[-1], lanelet.right.points[-1]].append(lane_index)
             if lanelet.tags.get("turn_direction"):
-                members.add(row)
+                members.add(lane_index)
                 if area := lanelet.tags.get("intersection_area", ""):
-                    areas[area].append(row)
+                    areas[area].append(lane_index)
         for rows in ends.values():
             if len(rows) > 1:
-                short = [row for row in rows if float(self.lines[row][-1, 5]) <= FORK]
+                short = [lane_index for lane_index in rows if float(self.lines[lane_index][-1, 5]) <= FORK]
                 members.update(short)
         group = list(range(len(self.lanelets)))
 
-        def root(row: int) -> int:
-            while group[row] != row:
-                group[row] = group[group[row]]
-                row = group[row]
-            return row
+        def root(lane_index: int) -> int:
+            while group[lane_index] != lane_index:
+                group[lane_index] = group[group[lane_index]]
+                lane_index = group[lane_index]
+            return lane_index
 
-        together = [*ends.values(), *areas.values(), *([row, *self.successors[row]] for row in members)]
+        together = [
+            *ends.values(),
+            *areas.values(),
+            *([lane_index, *self.successors[lane_index]] for lane_index in members),
+        ]
         for first, second in pairs:
             group[root(second)] = root(first)
         for rows in together:
-            inside = [row for row in rows if row in members]
-            for row in inside[1:]:
-                group[root(row)] = root(inside[0])
+            inside = [lane_index for lane_index in rows if lane_index in members]
+            for lane_index in inside[1:]:
+                group[root(lane_index)] = root(inside[0])
         numbers: dict[int, int] = {}
         result = np.full(len(self.lanelets), -1, np.int32)
-        for row in sorted(members):
-            result[row] = numbers.setdefault(root(row), len(numbers) + 1)
+        for lane_index in sorted(members):
+            result[lane_index] = numbers.setdefault(root(lane_index), len(numbers) + 1)
         return result
 
     def _crossings(self, driving: list[int]) -> Iterator[tuple[int, int]]:
         """Yield pairs of lanes that cross."""
-        boxes = np.array([(*line[:, :2].min(0), *line[:, :2].max(0)) for line in (self.lines[row] for row in driving)])
-        for index, row in enumerate(driving):
+        boxes = np.array(
+            [(*line[:, :2].min(0), *line[:, :2].max(0)) for line in (self.lines[lane_index] for lane_index in driving)]
+        )
+        for index, lane_index in enumerate(driving):
             rest = boxes[index + 1 :]
             near = (rest[:, :2] <= boxes[index, 2:]).all(1) & (rest[:, 2:] >= boxes[index, :2]).all(1)
             for other_index in np.flatnonzero(near).tolist():
-                other = driving[index + 1 + other_index]
-                if crossing(self.lines[row][:, :3], self.lines[other][:, :3]):
-                    yield row, other
+                other_lane = driving[index + 1 + other_index]
+                if crossing(self.lines[lane_index][:, :3], self.lines[other_lane][:, :3]):
+                    yield lane_index, other_lane
 
     def _smooth_headings(self) -> None:
         """Share the turn between lanes that follow each other among their ends, so that headings have no step."""
         turns: dict[tuple[int, int], list[float]] = defaultdict(list)
-        for row, followers in enumerate(self.successors):
+        for lane_index, followers in enumerate(self.successors):
             for follower in followers:
-                turn = wrap_scalar(float(self.lines[follower][0, 4] - self.lines[row][-1, 4]))
+                turn = wrap_scalar(float(self.lines[follower][0, 4] - self.lines[lane_index][-1, 4]))
                 if abs(turn) < SMOOTH:
-                    turns[row, -1].append(0.5 * turn)
+                    turns[lane_index, -1].append(0.5 * turn)
                     turns[follower, 0].append(-0.5 * turn)
-        for (row, end), shares in turns.items():
-            self.lines[row][end, 4] += sum(shares) / len(shares)
+        for (lane_index, end), shares in turns.items():
+            self.lines[lane_index][end, 4] += sum(shares) / len(shares)
 
 
 def _with_distance(rows: F64) -> F64:

@@ -41,22 +41,22 @@ class RuleReader:
     def arrays(self) -> dict[str, Any]:
         """Return the arrays of a `LaneGraph` on signals and signs."""
         lights, light_places, lonely_lights = self.lights()
-        signs, sign_places, sign_kinds = self.signs({row for row, _ in light_places})
+        signs, sign_places, sign_kinds = self.signs({lane_index for lane_index, _ in light_places})
         approaches = self.approaches(lights, light_places, signs, sign_places, sign_kinds)
         signals = place_signals(approaches)
         signals["stop_s"] = np.array(
             [
-                self.light_lines.get(lane, along)
-                for lane, along in zip(signals["stop_lane"].tolist(), signals["stop_s"].tolist(), strict=True)
+                self.light_lines.get(lane, line_position)
+                for lane, line_position in zip(signals["stop_lane"].tolist(), signals["stop_s"].tolist(), strict=True)
             ]
         )
         self.add_lonely_lights(signals, lights, lonely_lights)
         self.name_omissions()
         return signals | place_signs(approaches)
 
-    def approach_lanes(self, row: int) -> list[int]:
+    def approach_lanes(self, lane_index: int) -> list[int]:
         """Return the lanes before the junction that a lane crosses, or the lane itself outside of one."""
-        junction, pending, visited = int(self.lanes.junction[row]), [row], {row}
+        junction, pending, visited = int(self.lanes.junction[lane_index]), [lane_index], {lane_index}
         result: list[int] = []
         while pending:
             lane = pending.pop()
@@ -69,10 +69,10 @@ class RuleReader:
                     pending.append(predecessor)
         return sorted(result)
 
-    def leads_in(self, row: int) -> bool:
+    def leads_in(self, lane_index: int) -> bool:
         """Return whether a lane outside of junctions leads into one."""
-        return self.lanes.junction[row] < 0 and any(
-            self.lanes.junction[follower] >= 0 for follower in self.lanes.successors[row]
+        return self.lanes.junction[lane_index] < 0 and any(
+            self.lanes.junction[follower] >= 0 for follower in self.lanes.successors[lane_index]
         )
 
     def rules_of(self, subtype: str) -> Iterator[tuple[Rule, list[int]]]:
@@ -85,10 +85,10 @@ class RuleReader:
     def lanes_by_rule(self) -> dict[str, list[int]]:
         """Lanes for vehicles that refer to a rule, by its id."""
         lanes: dict[str, list[int]] = defaultdict(list)
-        for row, lanelet in enumerate(self.lanes.lanelets):
+        for lane_index, lanelet in enumerate(self.lanes.lanelets):
             for name in lanelet.rules:
-                if self.lanes.kinds[row] == LaneType.DRIVING:
-                    lanes[name].append(row)
+                if self.lanes.kinds[lane_index] == LaneType.DRIVING:
+                    lanes[name].append(lane_index)
         return dict(lanes)
 
     @cached_property
@@ -103,39 +103,41 @@ class RuleReader:
         places: dict[str, list[float]] = {}
         lanes_with_lights: set[tuple[int, str]] = set()
         lonely: dict[str, list[int]] = {}
-        for rule, rows in self.rules_of(LIGHT):
-            if not rows:
+        for rule, lane_indices in self.rules_of(LIGHT):
+            if not lane_indices:
                 self.report.omit("traffic lights that no lane for vehicles refers to", f"relation {rule.id[:30]}")
                 continue
-            approaches = sorted({lane for row in rows for lane in self.approach_lanes(row)})
+            approaches = sorted({lane for lane_index in lane_indices for lane in self.approach_lanes(lane_index)})
             before = [lane for lane in approaches if self.leads_in(lane)]
             if (xy := self.middle(rule.members.get("refers", ()))) is not None:
-                places[rule.id] = [*xy.tolist(), float(self.lanes.lines[(approaches or rows)[0]][-1, 4])]
+                places[rule.id] = [*xy.tolist(), float(self.lanes.lines[(approaches or lane_indices)[0]][-1, 4])]
             else:
                 self.report.note("traffic lights without a place stand at the end of their lane", f"relation {rule.id}")
             lanes_with_lights.update((lane, rule.id) for lane in before)
             if not before:
-                lonely[rule.id] = rows
+                lonely[rule.id] = lane_indices
         return places, lanes_with_lights, lonely
 
     def signs(self, with_lights: set[int]) -> tuple[dict[str, list[float]], dict[int, list[str]], dict[str, SignKind]]:
         """Return the places of signs, the signs of each lane, and their kinds: stop and yield before junctions."""
         ruled: dict[int, tuple[SignKind, tuple[str, ...]]] = {}
 
-        def add(row: int, kind: SignKind, refers: tuple[str, ...]) -> None:
-            if row not in ruled or kind == SignKind.STOP:
-                ruled[row] = (kind, refers)
+        def add(lane_index: int, kind: SignKind, refers: tuple[str, ...]) -> None:
+            if lane_index not in ruled or kind == SignKind.STOP:
+                ruled[lane_index] = (kind, refers)
 
-        for rule, rows in self.rules_of(SIGN):
+        for rule, lane_indices in self.rules_of(SIGN):
             kinds = [self.kind_of_sign(name) for name in rule.members.get("refers", ())]
             kind = next((kind for kind in kinds if kind is not None), None)
             if kind is None:
-                names = {self.subtype_of(name) for name in rule.members.get("refers", ())}
+                sign_codes = {self.subtype_of(name) for name in rule.members.get("refers", ())}
                 self.report.omit(
-                    f"traffic signs: {', '.join(sorted(names))[:60] or 'of no type'}", f"relation {rule.id}"
+                    f"traffic signs: {', '.join(sorted(sign_codes))[:60] or 'of no type'}", f"relation {rule.id}"
                 )
                 continue
-            lanes = [lane for row in rows for lane in self.approach_lanes(row) if self.leads_in(lane)]
+            lanes = [
+                lane for lane_index in lane_indices for lane in self.approach_lanes(lane_index) if self.leads_in(lane)
+            ]
             if not lanes:
                 self.report.omit("stop and yield signs before no junction", f"relation {rule.id[:30]}")
             for lane in lanes:
@@ -152,12 +154,12 @@ class RuleReader:
         places: dict[str, list[float]] = {}
         signs: dict[int, list[str]] = {}
         kinds_by_sign: dict[str, SignKind] = {}
-        for row, (kind, refers) in sorted(ruled.items()):
-            sign = f"{self.lanes.road[row]} {self.lanes.forward[row]} {kind.name}"
+        for lane_index, (kind, refers) in sorted(ruled.items()):
+            sign = f"{self.lanes.road[lane_index]} {self.lanes.forward[lane_index]} {kind.name}"
             kinds_by_sign[sign] = kind
-            signs[row] = [sign]
+            signs[lane_index] = [sign]
             if (xy := self.middle(refers)) is not None and sign not in places:
-                places[sign] = [*xy.tolist(), float(self.lanes.lines[row][-1, 4])]
+                places[sign] = [*xy.tolist(), float(self.lanes.lines[lane_index][-1, 4])]
         return places, signs, kinds_by_sign
 
     def yielding_lanes(self, with_lights: set[int]) -> Iterator[tuple[int, Rule]]:
@@ -167,35 +169,39 @@ class RuleReader:
         """
         yielding: dict[int, Rule] = {}
         for rule, _ in self.rules_of(RIGHT_OF_WAY):
-            for row in self.ruled_lanes(rule, "yield"):
-                yielding.setdefault(row, rule)
+            for lane_index in self.ruled_lanes(rule, "yield"):
+                yielding.setdefault(lane_index, rule)
         carried: set[int] = set()
-        for row, rule in sorted(yielding.items()):
-            for lane in self.approach_lanes(row):
-                ways = [row for row in self.lanes.successors[lane] if self.lanes.junction[row] >= 0]
-                inside = lane == row or all(way in yielding for way in ways)
+        for lane_index, rule in sorted(yielding.items()):
+            for lane in self.approach_lanes(lane_index):
+                ways = [
+                    lane_index for lane_index in self.lanes.successors[lane] if self.lanes.junction[lane_index] >= 0
+                ]
+                inside = lane == lane_index or all(way in yielding for way in ways)
                 if inside and lane not in with_lights and self.leads_in(lane):
-                    carried.add(row)
+                    carried.add(lane_index)
                     yield lane, rule
-        for row in sorted(set(yielding) - carried):
-            self.report.omit("right of way of single turns, or at traffic lights", self.lanes.place(row))
+        for lane_index in sorted(set(yielding) - carried):
+            self.report.omit("right of way of single turns, or at traffic lights", self.lanes.place(lane_index))
 
     def ruled_lanes(self, rule: Rule, role: str) -> list[int]:
         """Return the lanes for vehicles in a role of a rule."""
-        names = rule.members.get(role, ())
-        missing = [name for name in names if name not in self.lanelet_ids]
+        member_ids = rule.members.get(role, ())
+        missing = [name for name in member_ids if name not in self.lanelet_ids]
         for name in missing:
             self.report.doubt(
                 "a regulatory element refers to a lanelet that the map lacks", f"relation {rule.id[:30]}, {name[:30]}"
             )
-        rows = [self.lanes.row_of[name] for name in names if name in self.lanes.row_of]
-        return [row for row in rows if self.lanes.kinds[row] == LaneType.DRIVING]
+        lane_indices = [self.lanes.row_of[name] for name in member_ids if name in self.lanes.row_of]
+        return [lane_index for lane_index in lane_indices if self.lanes.kinds[lane_index] == LaneType.DRIVING]
 
     def middle(self, ways: tuple[str, ...]) -> F64 | None:
         """Return the middle of lines [2]; None where the map has none of them."""
-        rows = [row for name in ways if name in self.content.ways for row in self.content.ways[name].points]
-        places = self.content.xyz[rows, :2]
-        return places.mean(axis=0) if rows and np.isfinite(places).all() else None
+        lane_indices = [
+            lane_index for name in ways if name in self.content.ways for lane_index in self.content.ways[name].points
+        ]
+        places = self.content.xyz[lane_indices, :2]
+        return places.mean(axis=0) if lane_indices and np.isfinite(places).all() else None
 
     def subtype_of(self, way: str) -> str:
         """Return the subtype of a line, such as the code of a sign."""
@@ -216,12 +222,12 @@ class RuleReader:
         """Return what signals and signs are placed by."""
         lights_by_road: dict[int, list[SignalPlace]] = defaultdict(list)
         signs_by_road: dict[int, list[SignPlace]] = defaultdict(list)
-        for row, light in sorted(light_places):
-            lane = int(self.lanes.lane_id[row])
-            lights_by_road[int(self.lanes.road[row])].append(SignalPlace(light, lane, lane))
-        for row, names in sign_places.items():
-            lane = int(self.lanes.lane_id[row])
-            signs_by_road[int(self.lanes.road[row])] += [SignPlace(name, 0, lane, lane) for name in names]
+        for lane_index, light in sorted(light_places):
+            lane = int(self.lanes.lane_id[lane_index])
+            lights_by_road[int(self.lanes.road[lane_index])].append(SignalPlace(light, lane, lane))
+        for lane_index, sign_names in sign_places.items():
+            lane = int(self.lanes.lane_id[lane_index])
+            signs_by_road[int(self.lanes.road[lane_index])] += [SignPlace(name, 0, lane, lane) for name in sign_names]
         roads = {
             road: MapRoad(road, -1, 0.0, (), None, None, tuple(lights_by_road[road]), tuple(signs_by_road[road]))
             for road in sorted(set(self.lanes.road.tolist()))
@@ -254,26 +260,26 @@ class RuleReader:
     def light_lines(self) -> dict[int, float]:
         """Distance along a lane, m, of the stop line that its traffic light names."""
         result: dict[int, float] = {}
-        for rule, rows in self.rules_of(LIGHT):
+        for rule, lane_indices in self.rules_of(LIGHT):
             for name in rule.members.get("ref_line", ()):
                 way = self.content.ways.get(name)
                 if way is None or not way.points:
                     continue
                 points = self.content.xyz[list(way.points), :2]
-                for row in {lane for ruled in rows for lane in (ruled, *self.approach_lanes(ruled))}:
-                    line = self.lanes.lines[row]
-                    along = position_across(line[:, :2], points, 0.5 * float(line[:, 3].max()))
-                    if along is not None:
-                        result[row] = min(max(along, 0.0), float(line[-1, 5]))
+                for lane_index in {lane for ruled in lane_indices for lane in (ruled, *self.approach_lanes(ruled))}:
+                    line = self.lanes.lines[lane_index]
+                    line_position = position_across(line[:, :2], points, 0.5 * float(line[:, 3].max()))
+                    if line_position is not None:
+                        result[lane_index] = min(max(line_position, 0.0), float(line[-1, 5]))
         return result
 
     def add_lonely_lights(
         self, signals: dict[str, Any], places: Mapping[str, list[float]], lonely: Mapping[str, list[int]]
     ) -> None:
         """Add the lights that stand before no junction, such as at crosswalks."""
-        for name, rows in sorted(lonely.items()):
+        for name, lane_indices in sorted(lonely.items()):
             number = len(signals["signal_yaw"])
-            end = self.lanes.lines[rows[0]][-1]
+            end = self.lanes.lines[lane_indices[0]][-1]
             x, y = places[name][:2] if name in places else end[:2]
             for key, value in (
                 ("signal_xy", [[x, y]]),
@@ -281,9 +287,15 @@ class RuleReader:
                 ("signal_junction", [-1]),
                 ("signal_phase", [0]),
                 ("signal_virtual", [False]),
-                ("stop_signal", [number] * len(rows)),
-                ("stop_lane", rows),
-                ("stop_s", [self.light_lines.get(row, float(self.lanes.lines[row][-1, 5])) for row in rows]),
+                ("stop_signal", [number] * len(lane_indices)),
+                ("stop_lane", lane_indices),
+                (
+                    "stop_s",
+                    [
+                        self.light_lines.get(lane_index, float(self.lanes.lines[lane_index][-1, 5]))
+                        for lane_index in lane_indices
+                    ],
+                ),
             ):
                 signals[key] = np.concatenate([signals[key], np.array(value, signals[key].dtype)])
 
@@ -295,8 +307,8 @@ class RuleReader:
             if roles is None:
                 self.report.omit(f"regulatory elements of subtype '{rule.subtype[:30]}'", f"relation {rule.id[:30]}")
                 continue
-            for role, names in rule.members.items():
-                used.update(names)
+            for role, member_ids in rule.members.items():
+                used.update(member_ids)
                 if role not in roles:
                     self.report.omit(f"members of {rule.subtype} in the role '{role[:30]}'", f"relation {rule.id[:30]}")
         used |= self.content.lanelet_ways

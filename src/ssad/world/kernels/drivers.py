@@ -1,0 +1,165 @@
+"""Drivers of the population: how one of them follows, stops, errs and moves the pedals.
+
+Each has parameters of its own: `style`, `manner` and `habit` of `EpisodeArrays`. A reaction is, as in `traffic`, m/s^2
+and negative: here it is the acceleration that somebody or something allows, less the driver's own acceleration.
+
+A driver follows by the Intelligent Driver Model with its equilibrium at the desired gap (Treiber and Kesting 2013,
+section 11.3.4), and brakes no harder than the situation needs. Before a stop the deceleration is nearly constant.
+"""
+
+import warp as wp
+
+from ssad.world.kernels.data import Roads
+
+wp.set_module_options({"max_unroll": 0})  # see `traffic`
+
+LEADER_BRAKES = wp.constant(4.0)  # m/s^2 that a driver reckons a leader may brake with
+STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Rothery 1962: between 2.44 and 3.66)
+RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
+SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
+FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
+HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
+ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
+PREPARED = wp.constant(25.0)  # m before a junction from which a driver is ready to brake
+NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
+HARDEST = wp.constant(9.0)  # m/s^2
+CREEPS = wp.constant(4.0)  # m/s
+CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
+LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
+YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
+YIELD_LEAST = wp.constant(0.4)  # m before it at which a driver stops who is late
+SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
+SAMPLES = wp.constant(8)  # points of the road ahead at which a driver looks for bends
+LOOKS = wp.constant(200.0)  # m
+DRIFT = wp.constant(20.0)  # s over which the judgement of gaps changes
+LAPSE = wp.constant(2.0)  # s of an error
+SWERVE = wp.constant(6.0)  # s over which the place in the lane changes
+WANDER = wp.constant(0.05)  # m of it
+
+
+@wp.func
+def driver_follows(v: float, lead: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a leader `gap` metres ahead that drives at `lead` m/s."""
+    closing = v * (v - lead) / (2.0 * wp.sqrt(style[2] * style[3]))
+    ratio = (style[1] + wp.max(0.0, v * style[0] + closing)) / wp.max(gap, 0.1)
+    wish = style[2] * (1.0 - ratio * ratio)
+    room = wp.max(gap - LAST_GAP, 0.2)
+    slower = wp.max(v - lead, 0.0)
+    need = wp.max(slower * slower / (2.0 * room), v * v / (2.0 * (room + lead * lead / (2.0 * LEADER_BRAKES))))
+    return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - style[2]
+
+
+@wp.func
+def driver_stops(v: float, distance: float, style: wp.vec4) -> float:
+    """Return the reaction to a place `distance` metres ahead of the front, before which the driver stops.
+
+    It comes to rest about the standstill gap before the place, with the comfortable deceleration if there is time.
+    """
+    room = wp.max(distance - 0.8 * style[1], 0.3)
+    need = v * v / (2.0 * room)
+    share = need / style[3]
+    allowed = style[2] - (style[2] + style[3]) * share * share
+    if share > 1.0:
+        # who is late stops nearer to the place
+        late = v * v / (2.0 * wp.max(distance - LAST_GAP, 0.3))
+        allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
+    if distance < style[1]:
+        ratio = style[1] / wp.max(distance, 0.1)
+        allowed = wp.min(allowed, wp.max(style[2] * (1.0 - ratio * ratio), -style[3]))
+    return allowed - style[2]
+
+
+@wp.func
+def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
+    need = v * v / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
+    share = need / style[3]
+    allowed = style[2] - (style[2] + style[3]) * share * share
+    if share > 1.0:
+        late = v * v / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
+        if v < CREEPS:
+            late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
+        allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
+    if gap < YIELD_GAP + 0.5:
+        allowed = wp.min(allowed, -0.2 * style[3])
+    return allowed - style[2]
+
+
+@wp.func
+def driver_speed(roads: Roads, route: wp.vec2i, at: int, v: float, pace: float, deceleration: float) -> float:
+    """Return the speed from which the driver reaches every bend ahead at its speed there, slowing down early."""
+    slope = 2.0 * SLOWING * deceleration
+    reach = wp.min(v * v / slope + 8.0, LOOKS)
+    target = pace * roads.rule[route[0] + at][0]
+    for sample in range(SAMPLES):
+        metres = int(reach * float(sample + 1) / float(SAMPLES))
+        point = wp.min(at + metres, route[1] - 1)
+        cap = pace * roads.rule[route[0] + point][0]
+        target = wp.min(target, wp.sqrt(cap * cap + slope * float(point - at)))
+    return target
+
+
+@wp.func
+def driver_accelerates(v: float, target: float, style: wp.vec4) -> float:
+    """Return the acceleration on a free road, m/s^2; above the target speed a smooth return to it."""
+    if v > target:
+        return wp.max(-1.5 * (v - target), -style[3])
+    ratio = v / wp.max(target, 0.1)
+    return style[2] * (1.0 - ratio * ratio * ratio * ratio)
+
+
+@wp.func
+def slow_noise(key: int, time: float, period: float) -> float:
+    """Return a standard normal number that changes over `period` s: a function of key and time alone."""
+    place = time / period
+    first = int(place)
+    share = place - float(first)
+    before = wp.randn(wp.rand_init(key, first))
+    after = wp.randn(wp.rand_init(key, first + 1))
+    share = share * share * (3.0 - 2.0 * share)
+    mixed = before + share * (after - before)
+    # a mixture of two is narrower than each of them
+    return mixed / wp.sqrt((1.0 - share) * (1.0 - share) + share * share)
+
+
+@wp.func
+def judged_share(manner: wp.vec4, habit: wp.vec3, time: float) -> float:
+    """Return the factor with which the driver misjudges gaps: log-normal, correlated over `DRIFT` s.
+
+    Source: Treiber, Kesting and Helbing (2006), the estimation errors of the Human Driver Model.
+    """
+    share = float(1.0)
+    if manner[3] > 0.0:
+        share = wp.exp(manner[3] * wp.clamp(slow_noise(int(habit[2]), time, DRIFT), -3.0, 3.0))
+    return share
+
+
+@wp.func
+def is_lapsed(habit: wp.vec3, time: float) -> bool:
+    """Return whether the driver is in the midst of an error; each `LAPSE` s begin one with equal chance."""
+    if habit[1] <= 0.0:
+        return False
+    chance = habit[1] * LAPSE / 3600.0
+    return wp.randf(wp.rand_init(int(habit[2]) + 1, int(time / LAPSE))) < chance
+
+
+@wp.func
+def lane_place(habit: wp.vec3, time: float) -> float:
+    """Return how far left of the lane's middle the driver wants to be, m."""
+    return habit[0] + WANDER * wp.clamp(slow_noise(int(habit[2]) + 2, time, SWERVE), -2.0, 2.0)
+
+
+@wp.func
+def delay(reaction_time: float, speed: float, junction: float) -> float:
+    """Return the time until a driver begins to brake, s; junction: m to the next one, 0 inside."""
+    share = wp.clamp(speed / CRUISES, ATTENTIVE, 1.0)
+    if junction < PREPARED:
+        share = ATTENTIVE
+    return reaction_time * share
+
+
+@wp.func
+def pedal_change(demand: float, accel: float, jerk: float, dt: float) -> float:
+    """Return the acceleration to which a driver comes in a step, from `accel` towards `demand`."""
+    down = jerk * wp.clamp(-demand / HASTE, 1.0, 6.0)
+    return wp.clamp(demand, accel - down * dt, accel + jerk * dt)
