@@ -79,11 +79,11 @@ class Outcome:
         ego_speed: Speed of the ego then, m/s.
         gap: Minimum distance of the ego's body from an adversary's, m; 0 if they touched. None: no adversary
             present.
-        off_road: Whether an adversary that is a vehicle was on the road and left it.
+        off_road: Whether an adversary that is a vehicle was on the road, on the side of its direction, and left it.
         hit_others: Whether an adversary touched an agent other than the ego.
-        acceleration: Largest acceleration of an adversary that is a vehicle, along its heading or across, m/s^2,
-            as a mean over half a second.
-        jerk: Largest change of that along its heading, likewise, m/s^3.
+        acceleration: Largest acceleration of an adversary that is a vehicle from one step to the next, along its
+            heading or across, m/s^2.
+        jerk: Largest change of that along its heading, as means over half a second, m/s^3.
         within_limits: Whether all adversaries kept to the limits of their bodies and of a hard-braking driver.
     """
 
@@ -104,7 +104,7 @@ class Outcome:
 
     @property
     def is_valid(self) -> bool:
-        """True if the ego touched an adversary that stayed on the road and hit no other agent."""
+        """True if the ego touched an adversary that stayed on its side of the road and hit no other agent."""
         return self.collision and not self.off_road and not self.hit_others
 
     @property

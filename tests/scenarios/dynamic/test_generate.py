@@ -212,7 +212,9 @@ def test_a_contact_with_an_adversary_is_measured(graph: Any) -> None:
     contact = np.zeros(31, np.uint8)
     contact[20] = 1
     who = np.where(contact, 1, -1).astype(np.int32)
-    trace = make_trace(31, [ahead(8, 0), ahead(6, 30, yaw=math.pi), ahead(0, 500)], contact=contact, contact_agent=who)
+    y = 9000.0  # far from any lane, so that nobody drives against traffic
+    bodies = [ahead(8, 0, y), ahead(6, 30, y, math.pi), ahead(0, 500, y)]
+    trace = make_trace(31, bodies, contact=contact, contact_agent=who)
     hit = measure(Proposal(load_scenarios("precrash")[0]), trace, graph, [1, 2])
     assert hit.collision
     assert (hit.time, hit.impact_speed, hit.ego_speed) == pytest.approx((2.0, 14.0, 8.0))
@@ -250,6 +252,27 @@ def test_an_adversary_that_leaves_the_road_is_seen_and_one_that_joins_it_is_not(
     assert not measure(proposal, joins, graph, [1]).off_road
     walker = dataclasses.replace(leaves, kind=np.array([1, 6], np.uint8))
     assert not measure(proposal, walker, graph, [1]).off_road
+
+
+def test_an_adversary_that_comes_to_drive_against_traffic_leaves_its_road(graph: Any) -> None:
+    lane = int(np.flatnonzero((graph.kind == 1) & (graph.junction < 0) & (graph.length > 60) & (graph.left >= 0))[0])
+    opposite = int(graph.left[lane])
+    assert graph.road[lane] == graph.road[opposite]
+    assert graph.forward[lane] != graph.forward[opposite]
+    at = 10.0 + np.arange(31.0)  # m along the lane: 10 m/s
+    x, y, yaw, _ = graph.along(lane, at).T
+    width = 0.5 * (graph.width[graph.points(lane)][0] + graph.width[graph.points(opposite)][0])
+
+    def leaves(lateral: Any, heading: float = 0.0) -> bool:
+        body = (x - lateral * np.sin(yaw), y + lateral * np.cos(yaw), yaw + heading, 10.0)
+        trace = make_trace(31, [ahead(0, 500, 9000.0), body])
+        return measure(Proposal(load_scenarios("precrash")[0]), trace, graph, [1]).off_road
+
+    side = width * np.clip((np.arange(31) - 5) / 10, 0, 1)
+    assert not leaves(0.0)
+    assert not leaves(side, math.pi)  # it faces the other way: from the wrong side to its own
+    assert leaves(side)
+    assert not leaves(width)  # it has left nothing
 
 
 def test_efforts_beyond_a_body_are_seen(graph: Any) -> None:

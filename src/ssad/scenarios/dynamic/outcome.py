@@ -1,24 +1,34 @@
-"""Outcome of a proposal, measured from its trace: contact, gap, road departures and physical limits."""
+"""Outcome of a proposal, measured from its trace: contact, gap, departures from the lawful road, and limits."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from ssad.core.generators import Outcome, Proposal
+from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Body, EpisodeTrace, Model
 from ssad.metrics.criticality import trace_boxes
+from ssad.metrics.driving import first_contact
+from ssad.metrics.proven_collisions import (
+    LIMIT_TOLERANCE,
+    WRONG_WAY_TIME,
+    Accelerations,
+    CollisionProof,
+    longest_run,
+    peak_accelerations,
+    prove_collision,
+    touches_others,
+    wrong_way_steps,
+)
 from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
-from ssad.world.models import acceleration_limits, lateral_grip, model, model_with_body
+from ssad.world.models import acceleration_limits, agent_model, lateral_grip, model, model_with_body
 from ssad.world.roads.query import LaneQuery
 
-WINDOW = 0.5  # s over which accelerations and jerks are means
+WINDOW = 0.5  # s over which jerks are means; accelerations are those of each step
 MAX_JERK = 12.65  # m/s^3, of the careful and competent driver of UN Regulation 157
-TOLERANCE = 1.1  # factor up to which a limit counts as respected
 
 
 def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversaries: Sequence[int]) -> Outcome:
@@ -64,7 +74,7 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         ego_speed=ego_speed,
         gap=0.0 if len(contact_rows) else _min_gap(trace, agent_boxes, agent_indices),
         off_road=any(_leaves_road(trace, graph, agent) for agent in motor_vehicles),
-        hit_others=any(_hits_others(trace, agent_boxes, agent) for agent in agent_indices),
+        hit_others=any(touches_others(trace, agent, boxes=agent_boxes) for agent in agent_indices),
         acceleration=acceleration,
         jerk=jerk,
         within_limits=within_limits,
@@ -94,27 +104,48 @@ def _cached_lane_query(graph: LaneGraph) -> LaneQuery:
 
 
 def _leaves_road(trace: EpisodeTrace, graph: LaneGraph, agent: int) -> bool:
-    """Return True if the centre of an agent leaves the road after having been on it."""
+    """Return True if an agent leaves the road that is its own after having been on it.
+
+    Its centre leaves the road, or comes to drive against traffic for 0.3 s or up to the end. Who has driven against
+    traffic from the start has not left anything.
+    """
     present = trace.active[:, agent]
     if not present.any():
         return False
     off_road = _cached_lane_query(graph).off_road(np.stack([trace.x[present, agent], trace.y[present, agent]], 1))
-    return bool((np.diff(off_road.astype(np.int8)) > 0).any())
+    if (np.diff(off_road.astype(np.int8)) > 0).any():
+        return True
+    wrong_way = wrong_way_steps(trace, graph, agent)[present]
+    lawful_steps = np.flatnonzero(~wrong_way)
+    if not len(lawful_steps):
+        return False
+    wrong_way = wrong_way[lawful_steps[0] :]
+    return bool(wrong_way[-1]) or longest_run(wrong_way) >= round(WRONG_WAY_TIME / trace.dt)
 
 
-def _hits_others(trace: EpisodeTrace, box: F64, agent: int) -> bool:
-    """Return True if an agent touches another one, not the ego, that it did not touch from the start."""
-    reach = 0.5 * np.hypot(trace.length, trace.width)
-    for other_agent in range(1, len(trace.kind)):
-        both_present = trace.active[:, agent] & trace.active[:, other_agent]
-        centre_distance = np.hypot(*(box[:, agent, :2] - box[:, other_agent, :2]).T)
-        # The circle test is cheap and excludes nearly all rows before the exact box distance.
-        near_rows = np.flatnonzero(both_present & (centre_distance <= reach[agent] + reach[other_agent]))
-        if other_agent != agent and len(near_rows):
-            touching = obb_distance(box[near_rows, agent], box[near_rows, other_agent]) <= 0.0
-            if touching.any() and not (touching[0] and near_rows[0] == np.flatnonzero(both_present)[0]):
-                return True
-    return False
+def proof_of(base: Base, adversaries: Collection[str], *, avoidable: bool | None = None) -> CollisionProof:
+    """Check the conditions of a proven collision in a drive that ends in one.
+
+    Args:
+        base: The drive.
+        adversaries: Names of the agents that are adversaries.
+        avoidable: Whether a careful driver avoids the collision; None: not graded.
+
+    Returns:
+        The conditions.
+    """
+    trace = base.trace
+    _, agent = first_contact(trace)
+    limits = None
+    if agent > 0 and trace.kind[agent] <= AgentKind.BICYCLE:
+        limits = acceleration_budget(agent_model(base.episode.agents[agent]), base.scenario.friction)
+    indices = [index for index, name in enumerate(trace.names) if name in adversaries]
+    return prove_collision(trace, base.graph, indices, limits, avoidable=avoidable)
+
+
+def acceleration_budget(body: Model, friction: float) -> Accelerations:
+    """Return the largest accelerations that a vehicle can have on a surface."""
+    return Accelerations(*acceleration_limits(body, friction), lateral_grip(friction))
 
 
 def _peak_effort(
@@ -127,20 +158,15 @@ def _peak_effort(
     for agent, body in models.items():
         present_rows = np.flatnonzero(trace.active[:, agent])
         speed = trace.speed[present_rows, agent].astype(np.float64)
-        if len(speed) <= lag:
+        peaks = peak_accelerations(trace, agent)
+        if len(speed) <= lag or peaks is None:
             continue
         efforts = True
-        max_accel, max_brake = acceleration_limits(body, friction)
         longitudinal = (speed[lag:] - speed[:-lag]) / (lag * trace.dt)
-        yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[present_rows, agent].astype(np.float64)))) / trace.dt
-        lateral = np.abs(np.convolve(speed[1:] * yaw_rate, np.ones(lag) / lag, mode="valid"))
         jerk = np.abs(longitudinal[lag:] - longitudinal[:-lag]) / (lag * trace.dt)
-        max_acceleration = max(max_acceleration, float(np.abs(longitudinal).max()), float(lateral.max()))
+        max_acceleration = max(max_acceleration, peaks.forward, peaks.braking, peaks.lateral)
         max_jerk = max(max_jerk, float(jerk.max(initial=0.0)))
-        within_limits &= bool(
-            longitudinal.max() <= TOLERANCE * max_accel
-            and longitudinal.min() >= -TOLERANCE * max_brake
-            and lateral.max() <= TOLERANCE * lateral_grip(friction)
-            and jerk.max(initial=0.0) <= TOLERANCE * MAX_JERK
+        within_limits &= peaks.within(acceleration_budget(body, friction)) and bool(
+            jerk.max(initial=0.0) <= LIMIT_TOLERANCE * MAX_JERK
         )
     return (max_acceleration, max_jerk, within_limits) if efforts else (None, None, None)
