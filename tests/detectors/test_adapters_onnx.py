@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchvision.models import detection
 from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBoxGenerator
 from torchvision.models.detection.ssd import SSDHead
+from torchvision.ops import batched_nms
 
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, MissingExtraError, SSADError
@@ -174,6 +175,36 @@ def test_boxes_and_scores_are_those_of_the_network(layout: str, dynamic: bool, e
         score = score * rows[..., 4:5]  # of YOLOv5 and YOLOX a box has the score of its class times its objectness
     for found, best in zip(detector.predict(images, threshold=0.01), score.amax((1, 2)), strict=True):
         torch.testing.assert_close(found.score[0], best, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("layout", "iou"), [("yolov5", 0.45), ("yolov8", 0.7), ("yolox", 0.65)])
+def test_boxes_are_suppressed_within_a_class_as_the_source_does(
+    layout: str, iou: float, exported: Callable[..., Path]
+) -> None:
+    assert make_detector(f"onnx:{exported(layout)}").layout.iou == iou
+    detector, images = make_detector(f"onnx:{exported(layout)}?iou=0.2"), pictures(1)
+    dense = detector.dense(images)
+    quality = 1.0 if dense.quality is None else dense.quality[0].sigmoid()[:, None]
+    score = dense.logit[0].sigmoid() * quality
+    threshold = float(score.flatten().sort().values[-290])
+    place, label = (score > threshold).nonzero(as_tuple=True)
+    kept = batched_nms(dense.box[0, place].double(), score[place, label].double(), label, 0.2)
+    (found,) = detector.predict(images, threshold=threshold)
+    assert 3 < len(kept) < len(place), "some overlap, and several remain"
+    torch.testing.assert_close(found.score, score[place, label][kept])
+    assert found.label.tolist() == label[kept].tolist()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_objects_are_assigned_to_places_inside_them(layout: str, exported: Callable[..., Path]) -> None:
+    detector, truth = make_detector(f"onnx:{exported(layout)}"), true_boxes() * 2
+    dense = detector.dense(pictures(2))
+    assignment = detector.assign(dense, truth)
+    for owner, objects in zip(assignment.owner, truth, strict=True):
+        rows = owner >= 0
+        assert set(owner[rows].tolist()) == {0, 1}
+        place, box = dense.place[rows], objects.box[owner[rows]]
+        assert bool(((place > box[:, :2]) & (place < box[:, 2:])).all())
 
 
 def test_places_are_the_cells_of_each_level(exported: Callable[..., Path]) -> None:

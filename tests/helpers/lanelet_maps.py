@@ -79,7 +79,7 @@ def straight(x0: float, x1: float, y: float) -> list[Point]:
 def crossing_map() -> MapWriter:
     """Two one-way roads that cross, the eastbound one with a light; the junction is 20 m long."""
     road = MapWriter()
-    line = road.way([(-12.0, 2.0), (-12.0, -2.0)], type="stop_line")
+    line = road.way([(-32.0, 2.0), (-32.0, -2.0)], type="stop_line")
     lamp = road.way([(6.0, 3.0), (6.0, 4.0)], type="traffic_light", subtype="red_yellow_green")
     light = road.rule("traffic_light", [("refers", lamp), ("ref_line", line)])
     road.lanelet(straight(-60, -10, 2), straight(-60, -10, -2), light)

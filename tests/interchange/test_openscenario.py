@@ -330,7 +330,7 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
     path.write_text(text.replace('state="startTransition"', 'state="completeState"'))
     (actor,) = read_openscenario(path).scenario.actors
     ended = PhaseTrigger("phase_end", agent="adversary", phase="go", delay=3.5)
-    assert actor.phases[1] == Phase(0.0, ended, name="stop", shape="step", anytime=True)
+    assert actor.phases[1] == Phase(0.0, ended, name="stop", shape="step")
     timed = re.sub(
         "(?s)<ByEntityCondition>.*?</ByEntityCondition>",
         '<ByValueCondition><SimulationTimeCondition value="1.5" rule="greaterThan"/></ByValueCondition>',

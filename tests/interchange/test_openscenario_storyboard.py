@@ -142,7 +142,7 @@ def test_actions_become_phases_with_their_dynamics(tmp_path: Path) -> None:
     phases = actor.phases  # type: ignore[attr-defined]
     assert phases[0] == Phase(3.0, PhaseTrigger("time", 2.0), name="brake", acceleration=4.0)
     matched = {"reference": "ego", "factor": True, "shape": "sinusoidal", "duration": 4.0}
-    assert phases[1] == Phase(0.8, after, name="match", anytime=True, **matched)
+    assert phases[1] == Phase(0.8, after, name="match", **matched)
     assert [(phase.speed, phase.duration) for phase in phases[2:4]] == [(4.0, 3.0), (6.0, 2.0)]
     assert phases[3].when == PhaseTrigger("phase_end", agent="Target", phase="profile")
     assert phases[4].arrival.point == pytest.approx((301.4, -5.25))

@@ -26,12 +26,12 @@ _CONSTANTS: Final = {"pi": repr(math.pi)}
 # Names of declarations, which some files write with the $ of a reference.
 _DECLARED: Final = ("parameterRef", "variableRef", "parameterName")
 _RULES: Final = {
-    "equalTo": lambda value, limit: value == limit,
-    "notEqualTo": lambda value, limit: value != limit,
-    "greaterThan": lambda value, limit: value > limit,
-    "greaterOrEqual": lambda value, limit: value >= limit,
-    "lessThan": lambda value, limit: value < limit,
-    "lessOrEqual": lambda value, limit: value <= limit,
+    "equalTo": lambda value, limit_value: value == limit_value,
+    "notEqualTo": lambda value, limit_value: value != limit_value,
+    "greaterThan": lambda value, limit_value: value > limit_value,
+    "greaterOrEqual": lambda value, limit_value: value >= limit_value,
+    "lessThan": lambda value, limit_value: value < limit_value,
+    "lessOrEqual": lambda value, limit_value: value <= limit_value,
 }
 
 
@@ -47,15 +47,15 @@ class ConstraintError(FormatError):
     """A parameter has a value that its declaration excludes."""
 
 
-def read_document(path: Path) -> Element:
+def read_document(file_path: Path) -> Element:
     """Read the root of a file, unresolved. FormatError if it is no OpenSCENARIO XML."""
     root = read_xml(
-        path,
+        file_path,
         limit=MAX_BYTES,
-        element_factory=lambda tag, attributes, line: LineElement(tag, attributes, line, str(path)),
+        element_factory=lambda tag, attributes, line: LineElement(tag, attributes, line, str(file_path)),
     )
     if root.tag != "OpenSCENARIO":
-        raise FormatError(f"{path}: not OpenSCENARIO XML: its root is <{root.tag[:40]}>")
+        raise FormatError(f"{file_path}: not OpenSCENARIO XML: its root is <{root.tag[:40]}>")
     return root
 
 
@@ -182,14 +182,14 @@ class Scope:
 
     def _joined_text(self, expression: str) -> str | None:
         """Return the texts and parameters that + joins, as some tools name elements; None if it is no such text."""
-        parts = [part.strip() for part in expression.split("+")]
+        text_parts = [text_part.strip() for text_part in expression.split("+")]
         texts = []
-        for part in parts:
-            reference = _NAME.fullmatch(part)
-            if reference is None and not re.fullmatch(r"[\w ]+", part):
+        for text_part in text_parts:
+            reference = _NAME.fullmatch(text_part)
+            if reference is None and not re.fullmatch(r"[\w ]+", text_part):
                 return None
             try:
-                texts.append(self.value(reference[1]) if reference else part)
+                texts.append(self.value(reference[1]) if reference else text_part)
             except KeyError:
                 return None
         return "".join(texts)
@@ -200,29 +200,39 @@ class Scope:
             value = number_or_text(self.value(name))
             groups = declaration.findall("ConstraintGroup")
             limits = [
-                [(rule.get("rule", ""), self.text(rule, "value", rule.get("value", ""))) for rule in group]
-                for group in groups
+                [
+                    (constraint.get("rule", ""), self.text(constraint, "value", constraint.get("value", "")))
+                    for constraint in constraint_group
+                ]
+                for constraint_group in groups
             ]
-            if groups and not any(all(_holds(value, *limit) for limit in group) for group in limits):
-                stated = " or ".join(" and ".join(f"{rule} {limit}" for rule, limit in group) for group in limits)
+            if groups and not any(
+                all(_holds(value, *limit_value) for limit_value in constraint_group) for constraint_group in limits
+            ):
+                stated = " or ".join(
+                    " and ".join(f"{rule_name} {limit_value}" for rule_name, limit_value in constraint_group)
+                    for constraint_group in limits
+                )
                 raise error_at(
                     declaration, f"parameter '{name}' is {text_of(value)}, but must be {stated[:200]}", ConstraintError
                 )
 
 
-def _holds(value: float | bool | str, rule: str, limit_text: str) -> bool:
-    limit = number_or_text(limit_text)
-    if isinstance(value, str) != isinstance(limit, str):
-        return rule == "notEqualTo"
-    return rule in _RULES and bool(_RULES[rule](value, limit))
+def _holds(value: float | bool | str, rule_name: str, limit_text: str) -> bool:
+    limit_value = number_or_text(limit_text)
+    if isinstance(value, str) != isinstance(limit_value, str):
+        return rule_name == "notEqualTo"
+    return rule_name in _RULES and bool(_RULES[rule_name](value, limit_value))
 
 
-def resolve(root: Element, path: Path, assigned: Mapping[str, str] | None = None) -> tuple[Element, dict[str, str]]:
+def resolve(
+    root: Element, file_path: Path, assigned: Mapping[str, str] | None = None
+) -> tuple[Element, dict[str, str]]:
     """Return a document with parameters, expressions and catalogue entries put in.
 
     Args:
         root: The document, of `read_document`.
-        path: Its file; catalogues lie relative to it.
+        file_path: Its file; catalogues lie relative to it.
         assigned: Values that take the place of those that the document declares.
 
     Returns:
@@ -237,10 +247,12 @@ def resolve(root: Element, path: Path, assigned: Mapping[str, str] | None = None
     for name in assigned or {}:
         if name not in declarations:
             known = ", ".join(declarations) or "none"
-            raise FormatError(f"{path}: it declares no parameter '{name[:60]}' that could be set; declared: {known}")
+            raise FormatError(
+                f"{file_path}: it declares no parameter '{name[:60]}' that could be set; declared: {known}"
+            )
     scope = Scope(declarations, assigned or {})
     scope.check()
-    resolver = _Resolver(_Catalogues(root, path, scope))
+    resolver = _Resolver(_Catalogues(root, file_path, scope))
     resolved = resolver.copy(root, scope, declare=False)
     return resolved, {name: scope.value(name) for name in declarations}
 
@@ -298,12 +310,12 @@ class _Resolver:
 class _Catalogues:
     """Catalogues of the folders that a document names."""
 
-    def __init__(self, root: Element, path: Path, scope: Scope) -> None:
+    def __init__(self, root: Element, file_path: Path, scope: Scope) -> None:
         stated = [
             scope.text(directory, "path", directory.get("path", "")).replace("\\", "/")
             for directory in root.iterfind("CatalogLocations/*/Directory")
         ]
-        self.folders = [path.parent / folder for folder in stated if not Path(folder).is_absolute()]
+        self.folders = [file_path.parent / folder for folder in stated if not Path(folder).is_absolute()]
         self._catalogues: dict[str, dict[str, Element]] | None = None
 
     def entry(self, reference: Element) -> Element | None:
@@ -327,21 +339,23 @@ _FOLDERS: dict[tuple[tuple[str, int], ...], dict[str, dict[str, Element]]] = {}
 
 def _read_catalogues(folders: Sequence[Path]) -> dict[str, dict[str, Element]]:
     """Return the entries of the catalogues in folders: name of the catalogue -> name of the entry -> element."""
-    paths: list[Path] = []
+    catalogue_paths: list[Path] = []
     for folder in dict.fromkeys(folders):
-        paths += sorted(folder.glob("*.xosc")) if folder.is_dir() else [folder] * (folder.suffix == ".xosc")
-    paths = [path for path in dict.fromkeys(paths) if path.is_file()]
-    if len(paths) > MAX_CATALOGUES:
-        raise FormatError(f"{folders[0]}: {len(paths)} files of catalogues; at most {MAX_CATALOGUES} are read")
+        catalogue_paths += sorted(folder.glob("*.xosc")) if folder.is_dir() else [folder] * (folder.suffix == ".xosc")
+    catalogue_paths = [file_path for file_path in dict.fromkeys(catalogue_paths) if file_path.is_file()]
+    if len(catalogue_paths) > MAX_CATALOGUES:
+        raise FormatError(
+            f"{folders[0]}: {len(catalogue_paths)} files of catalogues; at most {MAX_CATALOGUES} are read"
+        )
     # A distribution resolves one document many times; its catalogues are read once.
-    key = tuple((str(path), path.stat().st_mtime_ns) for path in paths)
+    key = tuple((str(file_path), file_path.stat().st_mtime_ns) for file_path in catalogue_paths)
     if key not in _FOLDERS:
         _FOLDERS.clear()
         catalogues: dict[str, dict[str, Element]] = {}
-        for path in paths:
-            for catalogue in read_document(path).iterfind("Catalog"):
+        for file_path in catalogue_paths:
+            for catalogue in read_document(file_path).iterfind("Catalog"):
                 entries = {entry.get("name", ""): entry for entry in catalogue}
-                for name in dict.fromkeys((catalogue.get("name", ""), path.stem)):
+                for name in dict.fromkeys((catalogue.get("name", ""), file_path.stem)):
                     catalogues.setdefault(name, {}).update(entries)
         _FOLDERS[key] = catalogues
     return _FOLDERS[key]

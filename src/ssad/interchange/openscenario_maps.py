@@ -77,29 +77,29 @@ def find_map(root: Element, path: Path, report: ImportReport) -> DocumentMap:
     content = local_coordinates(raw)
     shift = (0.0, 0.0) if content == raw else read_network(source).shift
     digest = hashlib.sha256(content).hexdigest()
-    names = (stem, f"{stem}-{digest[:8]}", f"{stem}-{digest}")
-    for name in names:
-        if is_town(name) and _content(name) == digest:
-            return DocumentMap(name, shift)
-    name = next(name for name in names if not is_town(name))
-    if name != stem:
-        report.note(f"the map is imported as '{name}': the town '{stem}' has another map")
+    town_candidates = (stem, f"{stem}-{digest[:8]}", f"{stem}-{digest}")
+    for town_name in town_candidates:
+        if is_town(town_name) and _content(town_name) == digest:
+            return DocumentMap(town_name, shift)
+    town_name = next(town_name for town_name in town_candidates if not is_town(town_name))
+    if town_name != stem:
+        report.note(f"the map is imported as '{town_name}': the town '{stem}' has another map")
     map_report = ImportReport(str(source))
-    import_map(source, name, home_folder(), report=map_report)
-    report.contents.append(f"map {source.name} imported as town '{name}'")
+    import_map(source, town_name, home_folder(), report=map_report)
+    report.contents.append(f"map {source.name} imported as town '{town_name}'")
     for reason, places in map_report.omissions.items():
         report.note(f"not carried over from the map: {reason}", count=len(places))
     for reason, places in map_report.doubts.items():
         report.doubts.setdefault(f"map: {reason}", []).extend(places)
-    return DocumentMap(name, shift)
+    return DocumentMap(town_name, shift)
 
 
-def _content(name: str) -> str:
+def _content(town_name: str) -> str:
     """Return the hash of a town's map; "" if it has none."""
-    stored = home_folder() / "towns" / f"{name}.xodr"
+    stored = home_folder() / "towns" / f"{town_name}.xodr"
     try:
-        is_stored = name not in BUILT_IN and stored.is_file()
-        content = read_bytes(stored, limit=MAX_BYTES) if is_stored else town_xodr(name).encode()
+        is_stored = town_name not in BUILT_IN and stored.is_file()
+        content = read_bytes(stored, limit=MAX_BYTES) if is_stored else town_xodr(town_name).encode()
     except MapError:
         return ""
     return hashlib.sha256(content).hexdigest()
@@ -145,11 +145,11 @@ class RoadCoordinates:
         assert self.network is not None
         return LaneSampler(self.network)
 
-    def road(self, name: str) -> MapRoad | None:
+    def road(self, road_name: str) -> MapRoad | None:
         """Return a road by its id in the file; None if there is none."""
         if self.network is None:
             return None
-        number = self.network.road_names.get(name.strip())
+        number = self.network.road_names.get(road_name.strip())
         return None if number is None else self.network.roads.get(number)
 
     def at(self, road: MapRoad, s: float, t: float) -> tuple[float, float, float]:
@@ -159,40 +159,40 @@ class RoadCoordinates:
 
     def lane(self, road: MapRoad, lane: int, s: float) -> LaneSpot | None:
         """Return the middle of a lane at s; None if the road has no such lane there. Lane 0 is the centre line."""
-        section = next((part for part in road.sections if s <= part.s1), road.sections[-1])
+        section = next((lane_section for lane_section in road.sections if s <= lane_section.s1), road.sections[-1])
         offset = _cubic(road.offsets, s)
-        inner = width = 0.0
+        inner_edge = width = 0.0
         forward = not road.left_hand
         if lane:
             if lane not in section.lanes:
                 return None
-            side = 1 if lane > 0 else -1
-            for number in range(side, lane + side, side):
-                entry = section.lanes.get(number)
-                if entry is None:
+            side_sign = 1 if lane > 0 else -1
+            for number in range(side_sign, lane + side_sign, side_sign):
+                map_lane = section.lanes.get(number)
+                if map_lane is None:
                     return None
-                forward = entry.forward
-                inner += side * width
-                width = max(_cubic(entry.widths, s - section.base), 0.0)
-                if entry.borders:
-                    width = abs(_cubic(entry.borders, s - section.base) - inner)
-            inner += 0.5 * side * width
-        x, y, heading = self.at(road, s, inner + offset)
-        return LaneSpot(x, y, heading, inner + offset, width, forward)
+                forward = map_lane.forward
+                inner_edge += side_sign * width
+                width = max(_cubic(map_lane.widths, s - section.base), 0.0)
+                if map_lane.borders:
+                    width = abs(_cubic(map_lane.borders, s - section.base) - inner_edge)
+            inner_edge += 0.5 * side_sign * width
+        x, y, heading = self.at(road, s, inner_edge + offset)
+        return LaneSpot(x, y, heading, inner_edge + offset, width, forward)
 
     def forward_at(self, road: MapRoad, s: float, t: float) -> bool:
         """Return whether traffic at s and t of a road runs along it; true where there is no driving lane."""
-        section = next((part for part in road.sections if s <= part.s1), road.sections[-1])
+        section = next((lane_section for lane_section in road.sections if s <= lane_section.s1), road.sections[-1])
         spots = [
             (abs(spot.t - t), spot.forward)
-            for number, entry in section.lanes.items()
-            if entry.kind == LaneType.DRIVING and (spot := self.lane(road, number, s)) is not None
+            for number, map_lane in section.lanes.items()
+            if map_lane.kind == LaneType.DRIVING and (spot := self.lane(road, number, s)) is not None
         ]
         return min(spots)[1] if spots else True
 
     def lane_ids(self, road: MapRoad, s: float) -> list[int]:
         """Return the ids of the lanes of a road at s."""
-        section = next((part for part in road.sections if s <= part.s1), road.sections[-1])
+        section = next((lane_section for lane_section in road.sections if s <= lane_section.s1), road.sections[-1])
         return sorted(section.lanes)
 
 

@@ -155,15 +155,15 @@ class PositionReader:
             if len(poses) < 2:
                 raise self.values.error(element, "a route needs at least two waypoints")
             try:
-                way = route_along(self.graph, poses)
-                xy, yaw = way.xy.astype(np.float64), way.yaw.astype(np.float64)
+                route_line = route_along(self.graph, poses)
+                xy, heading_angle = route_line.xy.astype(np.float64), route_line.yaw.astype(np.float64)
             except RouteError:
                 xy = np.array([(pose.x, pose.y) for pose in poses], np.float64)
                 steps = np.diff(xy, axis=0)
-                yaw = np.arctan2(steps[:, 1], steps[:, 0])
-                yaw = np.append(yaw, yaw[-1])
+                heading_angle = np.arctan2(steps[:, 1], steps[:, 0])
+                heading_angle = np.append(heading_angle, heading_angle[-1])
             s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-            self._paths[id(element)] = SampledTrajectory(xy, yaw, s, None)
+            self._paths[id(element)] = SampledTrajectory(xy, heading_angle, s, None)
         return self._paths[id(element)]
 
     def waypoints(self, route: Element) -> tuple[Pose, ...]:
@@ -175,14 +175,16 @@ class PositionReader:
             if world is None or world.get("h") is not None or len(poses) < 2:
                 continue
             start, end = poses[index : index + 2] if index + 1 < len(poses) else poses[index - 1 : index + 1]
-            yaw = math.atan2(end.y - start.y, end.x - start.x)
-            poses[index] = Pose(poses[index].x, poses[index].y, yaw)
+            heading_angle = math.atan2(end.y - start.y, end.x - start.x)
+            poses[index] = Pose(poses[index].x, poses[index].y, heading_angle)
         return tuple(poses)
 
     def _world(self, element: Element) -> Pose:
-        x, y, yaw = (self.values.number(element, name, 0.0 if name == "h" else None) for name in ("x", "y", "h"))
+        x, y, heading_angle = (
+            self.values.number(element, name, 0.0 if name == "h" else None) for name in ("x", "y", "h")
+        )
         # Adding 0.0 turns a negative zero into zero.
-        return Pose(x - self._shift[0] + 0.0, self._hand * y - self._shift[1] + 0.0, self._hand * yaw + 0.0)
+        return Pose(x - self._shift[0] + 0.0, self._hand * y - self._shift[1] + 0.0, self._hand * heading_angle + 0.0)
 
     def _apply_orientation(self, element: Element, pose: Pose) -> Pose:
         """Return the pose with an Orientation of the element, relative unless it says absolute."""
@@ -200,69 +202,69 @@ class PositionReader:
         if self.roads.network is None:
             return None
         name = self.values.text(element, "roadId")
-        road = self.roads.road(name)
-        if road is None:
+        map_road = self.roads.road(name)
+        if map_road is None:
             raise self.values.error(element, f"town '{self.graph.name}' has no road {name[:40]}")
-        return road
+        return map_road
 
-    def _position_along(self, element: Element, road: MapRoad, s: float) -> float:
+    def _position_along(self, element: Element, map_road: MapRoad, s: float) -> float:
         """Return a position on a road, within it. FormatError if it is beyond its end."""
-        if not -EDGE <= s <= road.length + EDGE:
-            name = self.values.text(element, "roadId", str(road.id))
-            raise self.values.error(element, f"s is {s:g} m; road {name} has {road.length:.1f} m")
-        return min(max(s, 0.0), road.length)
+        if not -EDGE <= s <= map_road.length + EDGE:
+            name = self.values.text(element, "roadId", str(map_road.id))
+            raise self.values.error(element, f"s is {s:g} m; road {name} has {map_road.length:.1f} m")
+        return min(max(s, 0.0), map_road.length)
 
     def _lane(self, element: Element) -> Pose:
         lane_id = int(self.values.number(element, "laneId"))
         offset = self.values.number(element, "offset", 0.0)
-        road = self._find_road(element)
-        if road is None:
+        map_road = self._find_road(element)
+        if map_road is None:
             return self._lane_without_map(element, lane_id, offset)
-        s = self._position_along(element, road, self.values.number(element, "s"))
-        spot = self.roads.lane(road, lane_id, s)
+        s = self._position_along(element, map_road, self.values.number(element, "s"))
+        spot = self.roads.lane(map_road, lane_id, s)
         if spot is None:
-            known = ", ".join(map(str, self.roads.lane_ids(road, s)))
+            known = ", ".join(map(str, self.roads.lane_ids(map_road, s)))
             name = self.values.text(element, "roadId")
             raise self.values.error(element, f"road {name} has no lane {lane_id} at s {s:g}; it has {known}")
-        x, y, heading = self.roads.at(road, s, spot.t + offset)
-        yaw = heading if spot.forward else float(wrap_angle(heading + math.pi))
-        return self._apply_orientation(element, Pose(x, y, yaw))
+        x, y, heading = self.roads.at(map_road, s, spot.t + offset)
+        heading_angle = heading if spot.forward else float(wrap_angle(heading + math.pi))
+        return self._apply_orientation(element, Pose(x, y, heading_angle))
 
     def _lane_without_map(self, element: Element, lane: int, offset: float) -> Pose:
         """Return the pose on a lane of a town without OpenDRIVE, with s along the lane itself."""
         graph, s = self.graph, self.values.number(element, "s")
-        road = int(self.values.number(element, "roadId"))
-        sections = np.flatnonzero((graph.road == road) & (graph.lane_id == lane))
+        map_road = int(self.values.number(element, "roadId"))
+        sections = np.flatnonzero((graph.road == map_road) & (graph.lane_id == lane))
         if not len(sections):
-            raise self.values.error(element, f"town '{graph.name}' has no lane {lane} of road {road}")
+            raise self.values.error(element, f"town '{graph.name}' has no lane {lane} of road {map_road}")
         sections = sections[np.argsort(graph.section[sections])]
         length = float(graph.length[sections].sum())
         if not -EDGE <= s <= length + EDGE:
-            raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {road} has {length:.1f} m")
+            raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {map_road} has {length:.1f} m")
         self.omissions["positions by road and s are taken along the lane, not along the road's reference line"] += 1
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:
                 # Traffic of other lanes runs against s.
                 forward = bool(graph.forward[section])
-                place = LanePosition(section, min(max(s if forward else length - s, 0.0), length))
-                pose = move_pose(pose_at(graph, place), 0.0, offset if forward else -offset)
+                lane_place = LanePosition(section, min(max(s if forward else length - s, 0.0), length))
+                pose = move_pose(pose_at(graph, lane_place), 0.0, offset if forward else -offset)
                 return self._apply_orientation(element, pose)
             s -= length
         raise AssertionError
 
     def _road(self, element: Element) -> Pose:
-        t = self.values.number(element, "t")
-        road = self._find_road(element)
-        if road is None:
+        lateral_position = self.values.number(element, "t")
+        map_road = self._find_road(element)
+        if map_road is None:
             raise self.values.error(element, f"town '{self.graph.name}' has no OpenDRIVE, and so no road coordinates")
-        s = self._position_along(element, road, self.values.number(element, "s"))
-        return self._on_road(element, road, s, t)
+        s = self._position_along(element, map_road, self.values.number(element, "s"))
+        return self._on_road(element, map_road, s, lateral_position)
 
-    def _on_road(self, element: Element, road: MapRoad, s: float, t: float) -> Pose:
+    def _on_road(self, element: Element, map_road: MapRoad, s: float, lateral_position: float) -> Pose:
         """Return the pose at s and t: along the traffic there, or as an Orientation states."""
-        x, y, heading = self.roads.at(road, s, t)
-        if element.find("Orientation") is None and not self.roads.forward_at(road, s, t):
+        x, y, heading = self.roads.at(map_road, s, lateral_position)
+        if element.find("Orientation") is None and not self.roads.forward_at(map_road, s, lateral_position):
             heading = float(wrap_angle(heading + math.pi))
         return self._apply_orientation(element, Pose(x, y, heading))
 
@@ -281,17 +283,19 @@ class PositionReader:
     def _along_road(self, element: Element) -> Pose:
         """Return the pose ds along and dt across the road of an entity."""
         reference = self.start(self.values.text(element, "entityRef"), within=element)
-        place = self.lane_under(reference, aligned=False)
-        if place is None:
+        lane_place = self.lane_under(reference, aligned=False)
+        if lane_place is None:
             raise self.values.error(element, "no lane under the entity that it refers to")
         ds, dt = self.values.number(element, "ds"), self.values.number(element, "dt")
         if abs(ds) > LONGEST:
             raise self.values.error(element, f"ds is {ds:g} m, beyond {LONGEST:g} m")
-        side = 1.0 if self.graph.forward[place.lane] else -1.0
-        centre = pose_at(self.graph, place)
+        side = 1.0 if self.graph.forward[lane_place.lane] else -1.0
+        centre = pose_at(self.graph, lane_place)
         aside = -math.sin(centre.yaw) * (reference.x - centre.x) + math.cos(centre.yaw) * (reference.y - centre.y)
         ahead = ds * side
-        moved = place_ahead(self.graph, place, ahead) if ahead >= 0.0 else place_behind(self.graph, place, -ahead)
+        moved = (
+            place_ahead(self.graph, lane_place, ahead) if ahead >= 0.0 else place_behind(self.graph, lane_place, -ahead)
+        )
         pose = move_pose(pose_at(self.graph, moved), 0.0, aside + dt * side)
         if element.find("Orientation") is None and abs(wrap_angle(pose.yaw - reference.yaw)) > math.pi / 2:
             pose = Pose(pose.x, pose.y, float(wrap_angle(pose.yaw + math.pi)))
@@ -299,60 +303,64 @@ class PositionReader:
 
     def _along(self, element: Element) -> Pose:
         reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
-        place = self.lane_under(reference_pose) or self.lane_under(reference_pose, aligned=False)
-        if place is None:
+        lane_place = self.lane_under(reference_pose) or self.lane_under(reference_pose, aligned=False)
+        if lane_place is None:
             raise self.values.error(element, "no lane under the entity that it refers to")
         lateral_offset = self.values.number(element, "offset", 0.0)
         distance = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
         lane_count = self.values.lanes(element, "dLane")
         if abs(distance) > LONGEST:
             raise self.values.error(element, f"ds is {distance:g} m, beyond {LONGEST:g} m")
-        place = (
-            place_ahead(self.graph, place, distance) if distance >= 0.0 else place_behind(self.graph, place, -distance)
+        lane_place = (
+            place_ahead(self.graph, lane_place, distance)
+            if distance >= 0.0
+            else place_behind(self.graph, lane_place, -distance)
         )
-        pose = pose_at(self.graph, place)
+        pose = pose_at(self.graph, lane_place)
         to_left = lane_count > 0
         for _ in range(abs(lane_count)):
-            lane = int((self.graph.left if to_left else self.graph.right)[place.lane])
+            lane = int((self.graph.left if to_left else self.graph.right)[lane_place.lane])
             if lane < 0:
                 raise self.values.error(element, f"there is no lane {lane_count} beside the entity that it refers to")
             nearest = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
             match = int(np.flatnonzero(nearest[0] == lane)[0])
             to_left ^= not self.graph.is_same_direction(
-                place.lane, lane
+                lane_place.lane, lane
             )  # what is further left is on the right of those
-            place = LanePosition(lane, float(nearest[1][match]))
-            pose = pose_at(self.graph, place)
+            lane_place = LanePosition(lane, float(nearest[1][match]))
+            pose = pose_at(self.graph, lane_place)
         return self._apply_orientation(element, move_pose(pose, 0.0, lateral_offset))
 
     # ------------------------------------------------------------ on routes and trajectories
 
     def _route(self, element: Element) -> Pose:
         route = element.find("RouteRef/Route")
-        place = element.find("InRoutePosition")
-        content = None if place is None else next(iter(place), None)
+        lane_place = element.find("InRoutePosition")
+        content = None if lane_place is None else next(iter(lane_place), None)
         if route is None or content is None:
             raise self.values.error(element, "RouteRef or InRoutePosition is missing, or its catalogue is not there")
-        way = self.route(route)
+        route_line = self.route(route)
         if content.tag in ("FromCurrentEntity", "PositionOfCurrentEntity"):
             current = self.start(self.values.text(content, "entityRef"), within=content)
-            nearest = int(np.argmin(np.hypot(way.xy[:, 0] - current.x, way.xy[:, 1] - current.y)))
-            return self._apply_orientation(element, way.at(float(way.s[nearest])))
+            nearest = int(np.argmin(np.hypot(route_line.xy[:, 0] - current.x, route_line.xy[:, 1] - current.y)))
+            return self._apply_orientation(element, route_line.at(float(route_line.s[nearest])))
         s = self.values.number(content, "pathS")
-        if not -EDGE <= s <= float(way.s[-1]) + EDGE:
-            raise self.values.error(content, f"pathS is {s:g} m; the route has {way.s[-1]:.1f} m")
-        pose = way.at(s)
-        place_on_lane = self.lane_under(pose)
+        if not -EDGE <= s <= float(route_line.s[-1]) + EDGE:
+            raise self.values.error(content, f"pathS is {s:g} m; the route has {route_line.s[-1]:.1f} m")
+        pose = route_line.at(s)
+        lane_place_below = self.lane_under(pose)
         if content.tag in ("FromRoadCoordinates", "PositionInRoadCoordinates"):
-            t = self.values.number(content, "t")
-            if place_on_lane is not None:
-                return self._apply_orientation(element, self._beside_reference(pose, place_on_lane, t))
-            return self._apply_orientation(element, move_pose(pose, 0.0, t))
+            lateral_position = self.values.number(content, "t")
+            if lane_place_below is not None:
+                return self._apply_orientation(
+                    element, self._beside_reference(pose, lane_place_below, lateral_position)
+                )
+            return self._apply_orientation(element, move_pose(pose, 0.0, lateral_position))
         lane_id = int(self.values.number(content, "laneId"))
         offset = self.values.number(content, "laneOffset", 0.0)
-        if place_on_lane is None:
+        if lane_place_below is None:
             return self._apply_orientation(element, move_pose(pose, 0.0, offset))
-        target = self.neighbour(place_on_lane.lane, lane_id)
+        target = self.neighbour(lane_place_below.lane, lane_id)
         if target is None:
             raise self.values.error(content, f"the road under the route has no lane {lane_id} at pathS {s:g}")
         nearest_lanes = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[target])),))
@@ -362,19 +370,19 @@ class PositionReader:
         moved = move_pose(on_lane, 0.0, offset * side)
         return self._apply_orientation(element, Pose(moved.x, moved.y, pose.yaw))
 
-    def _beside_reference(self, pose: Pose, place: LanePosition, t: float) -> Pose:
+    def _beside_reference(self, pose: Pose, lane_place: LanePosition, lateral_position: float) -> Pose:
         """Return the pose of a route, moved to t of the road under it."""
-        road_number, lane_id = int(self.graph.road[place.lane]), int(self.graph.lane_id[place.lane])
-        road = None if self.roads.network is None else self.roads.network.roads.get(road_number)
-        if road is None:
-            return move_pose(pose, 0.0, t)
-        section = road.sections[min(int(self.graph.section[place.lane]), len(road.sections) - 1)]
-        forward = bool(self.graph.forward[place.lane])
-        s = section.s0 + place.s if forward else section.s1 - place.s
-        spot = self.roads.lane(road, lane_id, min(max(s, section.s0), section.s1))
+        road_number, lane_id = int(self.graph.road[lane_place.lane]), int(self.graph.lane_id[lane_place.lane])
+        map_road = None if self.roads.network is None else self.roads.network.roads.get(road_number)
+        if map_road is None:
+            return move_pose(pose, 0.0, lateral_position)
+        section = map_road.sections[min(int(self.graph.section[lane_place.lane]), len(map_road.sections) - 1)]
+        forward = bool(self.graph.forward[lane_place.lane])
+        s = section.s0 + lane_place.s if forward else section.s1 - lane_place.s
+        spot = self.roads.lane(map_road, lane_id, min(max(s, section.s0), section.s1))
         if spot is None:
-            return move_pose(pose, 0.0, t)
-        return move_pose(pose, 0.0, (t - spot.t) * (1.0 if forward else -1.0))
+            return move_pose(pose, 0.0, lateral_position)
+        return move_pose(pose, 0.0, (lateral_position - spot.t) * (1.0 if forward else -1.0))
 
     def neighbour(self, lane: int, lane_id: int) -> int | None:
         """Return the lane with an id in the same section of the road; None if there is none."""
@@ -388,8 +396,8 @@ class PositionReader:
         trajectory = element.find("TrajectoryRef/Trajectory")
         if trajectory is None:
             raise self.values.error(element, "TrajectoryRef is missing, or its catalogue is not there")
-        way = self.trajectory(trajectory)
-        s, t = self.values.number(element, "s"), self.values.number(element, "t", 0.0)
-        if not -EDGE <= s <= float(way.s[-1]) + EDGE:
-            raise self.values.error(element, f"s is {s:g} m; the trajectory has {way.s[-1]:.1f} m")
-        return self._apply_orientation(element, way.at(s, t))
+        route_line = self.trajectory(trajectory)
+        s, lateral_position = self.values.number(element, "s"), self.values.number(element, "t", 0.0)
+        if not -EDGE <= s <= float(route_line.s[-1]) + EDGE:
+            raise self.values.error(element, f"s is {s:g} m; the trajectory has {route_line.s[-1]:.1f} m")
+        return self._apply_orientation(element, route_line.at(s, lateral_position))

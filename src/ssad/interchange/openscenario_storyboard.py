@@ -124,16 +124,16 @@ class StoryboardReader:
         self.stories = [self._element(story, None) for story in root.iterfind("Storyboard/Story")]
         self._by_name: dict[str, list[StoryElement]] = {}
         for story in self.stories:
-            for item in story.every():
-                self._by_name.setdefault(item.path[-1], []).append(item)
+            for story_element in story.every():
+                self._by_name.setdefault(story_element.path[-1], []).append(story_element)
 
     def _element(self, element: Element, parent: StoryElement | None) -> StoryElement:
         name = self.values.text(element, "name", element.tag)
-        item = StoryElement(element, (*(parent.path if parent else ()), name), parent)
+        story_element = StoryElement(element, (*(parent.path if parent else ()), name), parent)
         deeper = _KINDS[_KINDS.index(element.tag) + 1] if element.tag in _KINDS[:-1] else None
         if deeper is not None:
-            item.children = [self._element(child, item) for child in element.iterfind(deeper)]
-        return item
+            story_element.children = [self._element(child, story_element) for child in element.iterfind(deeper)]
+        return story_element
 
     # ------------------------------------------------------------ what happens
 
@@ -141,7 +141,12 @@ class StoryboardReader:
         """Give the entities their phases, paths and trajectories."""
         for private in self.root.iterfind("Storyboard/Init/Actions/Private"):
             self._initial(private)
-        events = [item for story in self.stories for item in story.every() if item.element.tag == "Event"]
+        events = [
+            story_element
+            for story in self.stories
+            for story_element in story.every()
+            if story_element.element.tag == "Event"
+        ]
         planned = []
         for event in events:
             actors = self._actors(event)
@@ -177,10 +182,10 @@ class StoryboardReader:
     def _note_repetition(self, event: StoryElement) -> None:
         group = event.parent.parent if event.parent else None
         has_phases = any(part.phases for part in event.every())
-        for item in (event, *([group] if group else [])):
-            count = self.values.number(item.element, "maximumExecutionCount", 1.0)
-            if count > 1 and has_phases:
-                self.omissions[f"'{item.path[-1]}' takes place once, not up to {count:g} times"] += 1
+        for story_element in (event, *([group] if group else [])):
+            execution_count = self.values.number(story_element.element, "maximumExecutionCount", 1.0)
+            if execution_count > 1 and has_phases:
+                self.omissions[f"'{story_element.path[-1]}' takes place once, not up to {execution_count:g} times"] += 1
         if self.values.text(event.element, "priority", "override") == "skip" and has_phases:
             self.omissions[f"priority 'skip' of '{event.path[-1]}': it takes place beside other events"] += 1
 
@@ -202,9 +207,9 @@ class StoryboardReader:
                 if phase.shape == "step" and not phase.continuous:
                     entity.speed = self._start_speed(entity, phase)
                     continue
-            item = StoryElement(action, ("start",), None)
-            motion = self._plan(entity, action, item)
-            self._carry_out(motion, action, item, trigger=ALWAYS, label=f"the start of '{entity.name}'")
+            story_element = StoryElement(action, ("start",), None)
+            motion = self._plan(entity, action, story_element)
+            self._carry_out(motion, action, story_element, trigger=ALWAYS, label=f"the start of '{entity.name}'")
 
     def _start_speed(self, entity: Entity, phase: Phase) -> float:
         """Return the speed at the start that a phase states, also relative to that of another entity."""
@@ -217,7 +222,9 @@ class StoryboardReader:
 
     def _driver(self, entity: Entity, action: Element) -> None:
         for controller in action.iter("Controller"):
-            properties = {item.get("name", ""): item for item in controller.iter("Property")}
+            properties = {
+                property_element.get("name", ""): property_element for property_element in controller.iter("Property")
+            }
             if "target_speed" in properties:
                 entity.target_speed = self.values.number(properties["target_speed"], "value")
             name = self.values.text(controller, "name", "")
@@ -258,8 +265,8 @@ class StoryboardReader:
             return math.inf
         if not isinstance(trigger, PhaseTrigger) or trigger.any or trigger.edge != "none":
             return None
-        own = {"always": 0.0, "time": trigger.value + trigger.delay}.get(trigger.kind)
-        times = [own, *(self._time(part) for part in trigger.all)]
+        own_time = {"always": 0.0, "time": trigger.value + trigger.delay}.get(trigger.kind)
+        times = [own_time, *(self._time(part) for part in trigger.all)]
         known = [time for time in times if time is not None]
         return max(known) if len(known) == len(times) and trigger.rule != "below" else None
 
@@ -276,25 +283,25 @@ class StoryboardReader:
     def start(self, event: StoryElement, entity: Entity | None) -> Trigger:
         """Return the trigger of an event: its own and that of its act."""
         label = event.path[-1]
-        own = self.triggers.trigger(event.element.find("StartTrigger"), entity, label)
+        own_trigger = self.triggers.trigger(event.element.find("StartTrigger"), entity, label)
         act = self._around(event, "Act")
         if act is None:
-            return own
-        around = self.triggers.trigger(act.element.find("StartTrigger"), entity, act.path[-1])
-        if ALWAYS in (own, around) or not isinstance(own, PhaseTrigger):
-            return both(own, around)
-        if isinstance(around, PhaseTrigger) and not is_lasting(around):
+            return own_trigger
+        act_trigger = self.triggers.trigger(act.element.find("StartTrigger"), entity, act.path[-1])
+        if ALWAYS in (own_trigger, act_trigger) or not isinstance(own_trigger, PhaseTrigger):
+            return both(own_trigger, act_trigger)
+        if isinstance(act_trigger, PhaseTrigger) and not is_lasting(act_trigger):
             self.omissions[
                 f"that act '{act.path[-1]}' goes on after its trigger: '{label}' needs it still to hold"
             ] += 1
-        return both(around, own)
+        return both(act_trigger, own_trigger)
 
-    def _around(self, item: StoryElement, tag: str) -> StoryElement | None:
-        while item.element.tag != tag:
-            if item.parent is None:
+    def _around(self, story_element: StoryElement, tag: str) -> StoryElement | None:
+        while story_element.element.tag != tag:
+            if story_element.parent is None:
                 return None
-            item = item.parent
-        return item
+            story_element = story_element.parent
+        return story_element
 
     def _element_state(self, content: Element, label: str) -> Trigger:
         """Return the trigger that a StoryboardElementStateCondition means."""
@@ -303,37 +310,37 @@ class StoryboardReader:
         state = self.values.text(content, "state")
         parts = tuple(part.strip() for part in name.split("::"))
         candidates = [
-            item
-            for item in self._by_name.get(parts[-1], [])
-            if item.path[-len(parts) :] == parts and kind.lower() in ("", item.element.tag.lower())
+            story_element
+            for story_element in self._by_name.get(parts[-1], [])
+            if story_element.path[-len(parts) :] == parts and kind.lower() in ("", story_element.element.tag.lower())
         ]
         if not candidates:
             return self.triggers.never(content, label, f"there is no {kind or 'element'} '{name[:60]}'")
-        item = candidates[0]
-        events = [part for part in item.every() if part.element.tag == "Event"]
-        if item.element.tag == "Action" and item.parent is not None:
-            events = [item.parent]
+        story_element = candidates[0]
+        events = [part for part in story_element.every() if part.element.tag == "Event"]
+        if story_element.element.tag == "Action" and story_element.parent is not None:
+            events = [story_element.parent]
         begins = [self._takes_place(event, content, label) for event in events]
         if begins and not any(isinstance(trigger, PhaseTrigger) for trigger in begins):
             return begins[0]
         if state in ("startTransition", "runningState"):
-            return self._begun(item, content, label)
+            return self._begun(story_element, content, label)
         if state in ("endTransition", "completeState", "stopTransition", "skipTransition"):
-            return self._ended(item, content, label)
+            return self._ended(story_element, content, label)
         return ALWAYS if state == "standbyState" else Unfulfilled.UNKNOWN
 
-    def _begun(self, item: StoryElement, content: Element, label: str) -> Trigger:
-        phases = [phase for part in item.every() for phase in part.phases]
-        if phases and item.element.tag in ("Event", "Action"):
+    def _begun(self, story_element: StoryElement, content: Element, label: str) -> Trigger:
+        phases = [phase for part in story_element.every() for phase in part.phases]
+        if phases and story_element.element.tag in ("Event", "Action"):
             return PhaseTrigger("phase_start", agent=phases[0][0], phase=phases[0][1])
-        if item.element.tag in ("Story", "Act"):
-            act = item if item.element.tag == "Act" else next(iter(item.children), None)
+        if story_element.element.tag in ("Story", "Act"):
+            act = story_element if story_element.element.tag == "Act" else next(iter(story_element.children), None)
             if act is None:
                 return ALWAYS
             return self._guarded(act, content, label, partial(self._act_start, act))
-        events = [part for part in item.every() if part.element.tag == "Event"]
-        if item.element.tag == "Action" and item.parent is not None:
-            events = [item.parent]
+        events = [part for part in story_element.every() if part.element.tag == "Event"]
+        if story_element.element.tag == "Action" and story_element.parent is not None:
+            events = [story_element.parent]
         return any_of([self._guarded(event, content, label, partial(self._event_start, event)) for event in events])
 
     def _takes_place(self, event: StoryElement, content: Element, label: str) -> Trigger:
@@ -354,9 +361,11 @@ class StoryboardReader:
             self.omissions[f"that event '{event.path[-1]}' has begun is taken as its trigger"] += 1
         return trigger
 
-    def _guarded(self, item: StoryElement, content: Element, label: str, make: Callable[[], Trigger]) -> Trigger:
+    def _guarded(
+        self, story_element: StoryElement, content: Element, label: str, make: Callable[[], Trigger]
+    ) -> Trigger:
         """Return the start of an element; events that wait for each other never begin."""
-        key = id(item)
+        key = id(story_element)
         if key in self._starts:
             return self._starts[key]
         if key in self._open:
@@ -369,22 +378,22 @@ class StoryboardReader:
         self._starts[key] = result
         return result
 
-    def _ended(self, item: StoryElement, content: Element, label: str) -> Trigger:
-        if not item.phases and item.element.tag == "Action":
-            return self._after_start(item, content, label)
-        if item.element.tag == "Action":
+    def _ended(self, story_element: StoryElement, content: Element, label: str) -> Trigger:
+        if not story_element.phases and story_element.element.tag == "Action":
+            return self._after_start(story_element, content, label)
+        if story_element.element.tag == "Action":
             # The last phase of an action ends it, for each of its entities.
-            last = dict(item.phases)
+            last = dict(story_element.phases)
             return all_of([PhaseTrigger("phase_end", agent=name, phase=phase) for name, phase in last.items()])
-        if any(id(child) in self._open for child in item.every()):
+        if any(id(child) in self._open for child in story_element.every()):
             return self.triggers.never(content, label, "events wait for each other")
         children = [
             child
-            for child in item.children
+            for child in story_element.children
             if child.element.tag != "Event" or isinstance(self._takes_place(child, content, label), PhaseTrigger)
         ]
         parts = [self._ended(child, content, label) for child in children]
-        return all_of(parts) if parts else self._begun(item, content, label)
+        return all_of(parts) if parts else self._begun(story_element, content, label)
 
     def _after_start(self, action: StoryElement, content: Element, label: str) -> Trigger:
         """Return the end of an action that becomes no phase: its start, so much later as it takes."""
@@ -410,9 +419,9 @@ class StoryboardReader:
     def _name(self, action: StoryElement, entity: Entity) -> str:
         """Return a name for the phase of an action that no other phase has."""
         event = action.parent.path[-1] if action.parent else f"{action.path[-1]} of {entity.name}"
-        names = [event, f"{event} {action.path[-1]}"]
-        names += [f"{event} {action.path[-1]} {number}" for number in range(2, 1000)]
-        name = next((name for name in names if name not in self._names), names[-1])
+        candidate_names = [event, f"{event} {action.path[-1]}"]
+        candidate_names += [f"{event} {action.path[-1]} {number}" for number in range(2, 1000)]
+        name = next((name for name in candidate_names if name not in self._names), candidate_names[-1])
         self._names.add(name)
         return name
 
@@ -421,9 +430,9 @@ class StoryboardReader:
         motion = Motion(entity)
         if entity.ego:
             return motion
-        inner = next(iter(content), content)
-        if content.tag == "SynchronizeAction" or inner.tag == "SynchronizeAction":
-            motion.phases = self._arrival(entity, content if content.tag == "SynchronizeAction" else inner)
+        inner_action = next(iter(content), content)
+        if content.tag == "SynchronizeAction" or inner_action.tag == "SynchronizeAction":
+            motion.phases = self._arrival(entity, content if content.tag == "SynchronizeAction" else inner_action)
         elif (speed_action := content.find(".//SpeedAction")) is not None:
             speed_phase = self._speed_phase(entity, speed_action)
             motion.phases = [speed_phase] if speed_phase else []
@@ -475,8 +484,10 @@ class StoryboardReader:
     ) -> None:
         """Give an entity the phases of an action, or its path."""
         entity = motion.entity
-        inner = next(iter(content), content)
-        routing = content if content.tag == "RoutingAction" else inner if inner.tag == "RoutingAction" else None
+        inner_action = next(iter(content), content)
+        routing = (
+            content if content.tag == "RoutingAction" else inner_action if inner_action.tag == "RoutingAction" else None
+        )
         if motion.phases or motion.lateral:
             entity.phases += _with_trigger(motion.phases, trigger)
             entity.lateral += _with_trigger(motion.lateral, trigger)
@@ -485,8 +496,8 @@ class StoryboardReader:
         elif (keep := content.find(".//LongitudinalDistanceAction")) is not None:
             self._keep_distance(entity, keep, trigger, label)
         elif content.find(".//SpeedAction") is None and content.find(".//LaneChangeAction") is None:
-            if entity.ego and inner.tag in _OF_DRIVER:
-                self.omissions[f"{inner.tag} at {label}: the system under test drives the ego"] += 1
+            if entity.ego and inner_action.tag in _OF_DRIVER:
+                self.omissions[f"{inner_action.tag} at {label}: the system under test drives the ego"] += 1
             else:
                 self.record_omission(f"at {label}" if label.startswith("the start") else f"in {label}", content)
 
@@ -597,8 +608,8 @@ class StoryboardReader:
             poses = self._before_steady_state(action, poses, speed=speed, master=master)
         elif action.find("FinalSpeed/RelativeSpeedToMaster") is not None:
             self.omissions[f"the final speed of '{entity.name}', which depends on that of '{master.name}'"] += 1
-        own, other = ((pose.x, pose.y) for pose in poses)
-        return [Phase(speed, arrival=Arrival(own, other, self.triggers.agent_name(master)))]
+        own_place, other_place = ((pose.x, pose.y) for pose in poses)
+        return [Phase(speed, arrival=Arrival(own_place, other_place, self.triggers.agent_name(master)))]
 
     def _before_steady_state(self, action: Element, poses: list[Pose], *, speed: float, master: Entity) -> list[Pose]:
         """Return the places of a meeting, or those at which the steady state before it begins.
@@ -615,15 +626,15 @@ class StoryboardReader:
             return poses
         if speed <= 0.0 or distance <= 0.0:
             return poses
-        own, other = poses
+        own_place, other_place = poses
         back = master.speed * distance / speed
         start = self._centre(master, self.places.start(master.name, within=action))
-        if back <= 0.0 or back >= math.dist((start.x, start.y), (other.x, other.y)):
+        if back <= 0.0 or back >= math.dist((start.x, start.y), (other_place.x, other_place.y)):
             self.omissions[f"the steady state before the meeting with '{master.name}'"] += 1
             return poses
         return [
-            self._earlier(action.find("TargetPosition"), own, distance),
-            self._earlier(action.find("TargetPositionMaster"), other, back),
+            self._earlier(action.find("TargetPosition"), own_place, distance),
+            self._earlier(action.find("TargetPositionMaster"), other_place, back),
         ]
 
     def _earlier(self, position: Element | None, pose: Pose, distance: float) -> Pose:
@@ -680,19 +691,19 @@ class StoryboardReader:
 
     def _lanes_to(self, entity: Entity, other: Entity, lanes: int) -> int | None:
         """Return the number of lanes from the start lane of an entity to that `lanes` left of another's lane."""
-        own, reference = self._lane(entity), self._lane(other)
-        if own is None or reference is None:
+        own_lane, other_lane = self._lane(entity), self._lane(other)
+        if own_lane is None or other_lane is None:
             return None
-        return self._number(reference) + self._lanes.get(other.name, 0) + lanes - self._number(own)
+        return self._number(other_lane) + self._lanes.get(other.name, 0) + lanes - self._number(own_lane)
 
     def _number(self, place: LanePosition) -> int:
         """Return the number of lanes of the same direction on the right of a lane."""
-        graph, lane, count = self.places.graph, place.lane, 0
-        while (beside := int(graph.right[lane])) >= 0 and count < 20:
+        graph, lane, lane_count = self.places.graph, place.lane, 0
+        while (beside := int(graph.right[lane])) >= 0 and lane_count < 20:
             if graph.kind[beside] != graph.kind[lane] or not graph.is_same_direction(lane, beside):
                 break
-            lane, count = beside, count + 1
-        return count
+            lane, lane_count = beside, lane_count + 1
+        return lane_count
 
     def _lanes_to_id(self, entity: Entity, lane_id: int) -> int | None:
         """Return the number of lanes from the start lane of an entity to that with an id."""
@@ -701,15 +712,15 @@ class StoryboardReader:
             return None
         graph = self.places.graph
         for side, step in ((graph.left, 1), (graph.right, -1)):
-            lane, count, neighbours = place.lane, 0, side
-            while lane >= 0 and abs(count) <= 20:
+            lane, lane_count, neighbours = place.lane, 0, side
+            while lane >= 0 and abs(lane_count) <= 20:
                 if int(graph.lane_id[lane]) == lane_id:
-                    return count
+                    return lane_count
                 beside = int(neighbours[lane])
                 if beside >= 0 and not graph.is_same_direction(lane, beside):
                     # Further left of the oncoming lanes is on their right.
                     neighbours = graph.right if neighbours is graph.left else graph.left
-                lane, count = beside, count + step
+                lane, lane_count = beside, lane_count + step
         return None
 
     def _lane_offset(self, entity: Entity, action: Element) -> LateralPhase:
@@ -762,13 +773,15 @@ class StoryboardReader:
 
     def _place_at_distance(self, entity: Entity, other: Entity, action: Element) -> None:
         """Place an entity along the lane of another, at a distance to it."""
-        own = self._centre(entity, self.places.start(entity.name, within=action))
+        own_pose = self._centre(entity, self.places.start(entity.name, within=action))
         reference = self._centre(other, self.places.start(other.name, within=action))
         distance = self.values.number(action, "distance", math.nan if action.get("timeGap") is None else 0.0)
         if action.get("timeGap") is not None:
             distance = self.values.number(action, "timeGap") * entity.speed
         displacement = self.values.text(action, "displacement", "any")
-        ahead = math.cos(reference.yaw) * (own.x - reference.x) + math.sin(reference.yaw) * (own.y - reference.y)
+        ahead = math.cos(reference.yaw) * (own_pose.x - reference.x) + math.sin(reference.yaw) * (
+            own_pose.y - reference.y
+        )
         side = {"leadingReferencedEntity": 1.0, "trailingReferencedEntity": -1.0}.get(
             displacement, math.copysign(1, ahead)
         )
@@ -777,13 +790,13 @@ class StoryboardReader:
         else:
             distance += side * (entity.centre[0] - other.centre[0])
         shift = side * distance - ahead
-        place = self.places.lane_under(own)
+        place = self.places.lane_under(own_pose)
         if place is None:
-            moved = move_pose(own, shift, 0.0)
+            moved = move_pose(own_pose, shift, 0.0)
         else:
             graph = self.places.graph
             centre = pose_at(graph, place)
-            aside = -math.sin(centre.yaw) * (own.x - centre.x) + math.cos(centre.yaw) * (own.y - centre.y)
+            aside = -math.sin(centre.yaw) * (own_pose.x - centre.x) + math.cos(centre.yaw) * (own_pose.y - centre.y)
             there = place_ahead(graph, place, shift) if shift >= 0.0 else place_behind(graph, place, -shift)
             moved = move_pose(pose_at(graph, there), 0.0, aside)
         self.places.moved[entity.name] = move_pose(moved, -entity.centre[0], -entity.centre[1])
@@ -796,22 +809,22 @@ class StoryboardReader:
     def _routing(
         self, entity: Entity, routing: Element, action: StoryElement, trigger: PhaseTrigger, label: str
     ) -> None:
-        inner = next(iter(routing), routing)
-        if inner.tag == "AcquirePositionAction":
-            position = inner.find("Position")
+        inner_action = next(iter(routing), routing)
+        if inner_action.tag == "AcquirePositionAction":
+            position = inner_action.find("Position")
             if self.places.is_supported(position):
-                entity.route = (self.places.pose(position, within=inner),)
+                entity.route = (self.places.pose(position, within=inner_action),)
                 self._note_late(trigger, label, "heads for that position from the start", entity)
                 return
-        elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
-            route = inner.find("Route")
+        elif inner_action.tag == "AssignRouteAction" and inner_action.find("Route") is not None:
+            route = inner_action.find("Route")
             assert route is not None
-            if all(self.places.is_supported(item.find("Position")) for item in route.iterfind("Waypoint")):
+            if all(self.places.is_supported(waypoint.find("Position")) for waypoint in route.iterfind("Waypoint")):
                 entity.route = self.places.waypoints(route)
                 self._note_late(trigger, label, "has that route from the start", entity)
                 return
-        elif inner.tag == "FollowTrajectoryAction":
-            self._trajectory(entity, inner, action, trigger, label)
+        elif inner_action.tag == "FollowTrajectoryAction":
+            self._trajectory(entity, inner_action, action, trigger, label)
             return
         self.record_omission(f"of '{entity.name}'", routing)
 
@@ -874,30 +887,32 @@ class StoryboardReader:
             speed = self._limited_speed(entity, float(steps[first:last].sum() / max(times[last] - times[first], 1e-3)))
             when = trigger
             if previous:
-                begun = PhaseTrigger("phase_start", agent=entity.name, phase=previous)
-                when = replace(begun, delay=times[first] - times[previous_first])
+                begun_trigger = PhaseTrigger("phase_start", agent=entity.name, phase=previous)
+                when = replace(begun_trigger, delay=times[first] - times[previous_first])
             previous, previous_first = self._name(action, entity), first
             entity.phases.append(Phase(speed, when, name=previous, shape="step", anytime=True))
             action.phases.append((entity.name, previous))
 
     def find_trajectory(self, follow: Element, entity: Entity) -> SampledTrajectory | None:
         """Return the trajectory of an action, from where it begins; None if it is not read."""
-        element = next((item for item in follow.iter("Trajectory")), None)
-        if element is None or not all(self.places.is_supported(item) for item in element.iter("Position")):
+        element = next(follow.iter("Trajectory"), None)
+        if element is None or not all(
+            self.places.is_supported(position_element) for position_element in element.iter("Position")
+        ):
             return None
         way = self.places.trajectory(element, entity.name if entity.placed else "")
         skipped = self.values.number(follow, "initialDistanceOffset", 0.0)
         if skipped <= 0.0 or skipped >= float(way.s[-1]):
             return way
-        rest = int(np.searchsorted(way.s, skipped, side="right"))
+        rest_index = int(np.searchsorted(way.s, skipped, side="right"))
         start = way.at(skipped)
         times = None
         if way.times is not None:
-            times = np.concatenate([[float(np.interp(skipped, way.s, way.times))], way.times[rest:]])
+            times = np.concatenate([[float(np.interp(skipped, way.s, way.times))], way.times[rest_index:]])
         return SampledTrajectory(
-            np.concatenate([[(start.x, start.y)], way.xy[rest:]]),
-            np.concatenate([[start.yaw], way.yaw[rest:]]),
-            np.concatenate([[0.0], way.s[rest:] - skipped]),
+            np.concatenate([[(start.x, start.y)], way.xy[rest_index:]]),
+            np.concatenate([[start.yaw], way.yaw[rest_index:]]),
+            np.concatenate([[0.0], way.s[rest_index:] - skipped]),
             times,
         )
 
@@ -918,16 +933,18 @@ def _in_sequence(phases: Sequence, entity: str) -> list:  # type: ignore[type-ar
             required.append(other.name)
             if not other.anytime:
                 break
-        begun = {name: PhaseTrigger("phase_start", agent=entity, phase=name) for name in required}
-        late = [part for part in parts if required and replace(part, delay=0.0) == begun[required[0]] and part.delay]
+        begun_trigger = {name: PhaseTrigger("phase_start", agent=entity, phase=name) for name in required}
+        delayed = [
+            part for part in parts if required and replace(part, delay=0.0) == begun_trigger[required[0]] and part.delay
+        ]
         ended = {part.phase for part in parts if part.kind == "phase_end" and part.agent == entity}
         if index == 0:
             result.append(replace(phase, anytime=False))
-        elif late and len(parts) == len(required) == 1:
-            result.append(replace(phase, when=PhaseTrigger("after", late[0].delay), anytime=False))
-        elif all(begun[name] in parts or name in ended for name in required):
-            rest = [part for part in parts if part not in begun.values()]
-            result.append(replace(phase, when=all_of(rest) if rest else ALWAYS, anytime=False))
+        elif delayed and len(parts) == len(required) == 1:
+            result.append(replace(phase, when=PhaseTrigger("after", delayed[0].delay), anytime=False))
+        elif all(begun_trigger[name] in parts or name in ended for name in required):
+            remaining = [part for part in parts if part not in begun_trigger.values()]
+            result.append(replace(phase, when=all_of(remaining) if remaining else ALWAYS, anytime=False))
         else:
             result.append(phase)
     return result

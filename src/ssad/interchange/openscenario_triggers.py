@@ -45,7 +45,7 @@ def is_lasting(trigger: PhaseTrigger) -> bool:
         trigger.kind in _LASTING
         and trigger.rule != "below"
         and trigger.edge == "none"
-        and all(is_lasting(part) for part in (*trigger.all, *trigger.any))
+        and all(is_lasting(trigger_part) for trigger_part in (*trigger.all, *trigger.any))
     )
 
 
@@ -54,36 +54,55 @@ def both(first: Trigger, second: Trigger) -> Trigger:
     return all_of([first, second])
 
 
-def all_of(parts: Sequence[Trigger]) -> Trigger:
+def all_of(trigger_parts: Sequence[Trigger]) -> Trigger:
     """Return the trigger that holds where all do; parts without a counterpart are left out if others have one."""
-    if Unfulfilled.NEVER in parts:
+    if Unfulfilled.NEVER in trigger_parts:
         return Unfulfilled.NEVER
-    triggers = [part for part in parts if isinstance(part, PhaseTrigger)]
-    if not triggers and parts:
+    triggers = [trigger_part for trigger_part in trigger_parts if isinstance(trigger_part, PhaseTrigger)]
+    if not triggers and trigger_parts:
         return Unfulfilled.UNKNOWN
-    distinct = list(dict.fromkeys(part for part in triggers if part != ALWAYS))
+    distinct = list(dict.fromkeys(trigger_part for trigger_part in triggers if trigger_part != ALWAYS))
     # What has ended has begun.
-    ended = {(part.agent, part.phase) for part in distinct if part.kind == "phase_end"}
-    distinct = [part for part in distinct if not (part.kind == "phase_start" and (part.agent, part.phase) in ended)]
+    ended = {(trigger_part.agent, trigger_part.phase) for trigger_part in distinct if trigger_part.kind == "phase_end"}
+    distinct = [
+        trigger_part
+        for trigger_part in distinct
+        if not (trigger_part.kind == "phase_start" and (trigger_part.agent, trigger_part.phase) in ended)
+    ]
     if not distinct:
         return ALWAYS
     return distinct[0] if len(distinct) == 1 else PhaseTrigger(all=tuple(distinct))
 
 
-def any_of(parts: Sequence[Trigger]) -> Trigger:
+def any_of(trigger_parts: Sequence[Trigger]) -> Trigger:
     """Return the trigger that holds where one does; parts without a counterpart are left out if others have one."""
-    triggers = list(dict.fromkeys(part for part in parts if isinstance(part, PhaseTrigger)))
+    triggers = list(
+        dict.fromkeys(trigger_part for trigger_part in trigger_parts if isinstance(trigger_part, PhaseTrigger))
+    )
     if not triggers:
-        return Unfulfilled.UNKNOWN if Unfulfilled.UNKNOWN in parts else Unfulfilled.NEVER
+        return Unfulfilled.UNKNOWN if Unfulfilled.UNKNOWN in trigger_parts else Unfulfilled.NEVER
     if ALWAYS in triggers:
         return ALWAYS
-    triggers = [part for part in triggers if not any(_implies(part, other) for other in triggers if other is not part)]
+    triggers = [
+        trigger_part
+        for trigger_part in triggers
+        if not any(
+            _implies(trigger_part, other_trigger) for other_trigger in triggers if other_trigger is not trigger_part
+        )
+    ]
     if len(triggers) == 1:
         return triggers[0]
-    shared = [part for part in conjuncts(triggers[0]) if all(part in conjuncts(other) for other in triggers)]
+    shared = [
+        trigger_part
+        for trigger_part in conjuncts(triggers[0])
+        if all(trigger_part in conjuncts(other_trigger) for other_trigger in triggers)
+    ]
     if not shared:
         return PhaseTrigger(any=tuple(triggers))
-    rest = [all_of([part for part in conjuncts(trigger) if part not in shared] or [ALWAYS]) for trigger in triggers]
+    rest = [
+        all_of([trigger_part for trigger_part in conjuncts(trigger) if trigger_part not in shared] or [ALWAYS])
+        for trigger in triggers
+    ]
     return all_of([*shared, any_of(rest)])
 
 
@@ -92,12 +111,14 @@ def conjuncts(trigger: PhaseTrigger) -> tuple[PhaseTrigger, ...]:
     return trigger.all if trigger.all and trigger == PhaseTrigger(all=trigger.all) else (trigger,)
 
 
-def _implies(trigger: PhaseTrigger, other: PhaseTrigger) -> bool:
+def _implies(trigger: PhaseTrigger, other_trigger: PhaseTrigger) -> bool:
     """Return whether one trigger holds only where another does, as far as their parts show."""
-    parts = set(conjuncts(trigger))
-    begun = {replace(part, kind="phase_start") for part in parts if part.kind == "phase_end"}
-    required = set(conjuncts(other))
-    return required <= parts | begun and not (parts <= required)
+    trigger_parts = set(conjuncts(trigger))
+    begun = {
+        replace(trigger_part, kind="phase_start") for trigger_part in trigger_parts if trigger_part.kind == "phase_end"
+    }
+    required = set(conjuncts(other_trigger))
+    return required <= trigger_parts | begun and not (trigger_parts <= required)
 
 
 class TriggerReader:
@@ -151,8 +172,8 @@ class TriggerReader:
         groups = [] if element is None else element.findall("ConditionGroup")
         alternatives = []
         for group in groups:
-            parts = [self._condition(condition, entity, label) for condition in group.iterfind("Condition")]
-            alternatives.append(all_of(parts) if parts else ALWAYS)
+            trigger_parts = [self._condition(condition, entity, label) for condition in group.iterfind("Condition")]
+            alternatives.append(all_of(trigger_parts) if trigger_parts else ALWAYS)
         if not alternatives:
             return ALWAYS
         result = any_of(alternatives)
@@ -223,7 +244,7 @@ class TriggerReader:
         """Return the trigger of a condition on a value that never changes."""
         value, limit = number_or_text(value_text), number_or_text(self.values.text(content, "value"))
         if isinstance(value, str) or isinstance(limit, str):
-            holds = (str(value) == str(limit)) == (rule != "notEqualTo")
+            is_fulfilled = (str(value) == str(limit)) == (rule != "notEqualTo")
         else:
             compare = {
                 "equalTo": value == limit,
@@ -233,8 +254,8 @@ class TriggerReader:
                 "lessThan": value < limit,
                 "lessOrEqual": value <= limit,
             }
-            holds = compare.get(rule, False)
-        return ALWAYS if holds else Unfulfilled.NEVER
+            is_fulfilled = compare.get(rule, False)
+        return ALWAYS if is_fulfilled else Unfulfilled.NEVER
 
     # ------------------------------------------------------------ conditions on entities
 
@@ -242,10 +263,10 @@ class TriggerReader:
         triggering = [self.referenced_entity(item) for item in condition.iterfind(".//TriggeringEntities/EntityRef")]
         if not triggering:
             raise self.values.error(condition, "TriggeringEntities is missing or empty")
-        parts = [self._of_entity(content, agent, entity, label) for agent in triggering]
+        trigger_parts = [self._of_entity(content, agent, entity, label) for agent in triggering]
         element = condition.find(".//TriggeringEntities")
         rule = "any" if element is None else self.values.text(element, "triggeringEntitiesRule", "any")
-        return all_of(parts) if rule == "all" else any_of(parts)
+        return all_of(trigger_parts) if rule == "all" else any_of(trigger_parts)
 
     def _of_entity(self, content: Element, agent: Entity, entity: Entity | None, label: str) -> Trigger:
         name = "" if agent is entity else self.agent_name(agent)
@@ -263,8 +284,10 @@ class TriggerReader:
         if content.tag in ("RelativeDistanceCondition", "TimeHeadwayCondition"):
             kind = "distance" if content.tag == "RelativeDistanceCondition" else "time_headway"
             result = PhaseTrigger(kind, agent=name, reference=self._reference(content, agent, entity))  # type: ignore[arg-type]
-            other = self.referenced_entity(content)
-            return self._ego_distance(self._compared(self._measured(result, content), content, label), agent, other)
+            other_trigger = self.referenced_entity(content)
+            return self._ego_distance(
+                self._compared(self._measured(result, content), content, label), agent, other_trigger
+            )
         if content.tag == "TimeToCollisionCondition":
             target = content.find("TimeToCollisionConditionTarget")
             entity_ref = None if target is None else target.find("EntityRef")
@@ -297,10 +320,12 @@ class TriggerReader:
 
     def _reference(self, element: Element, agent: Entity, entity: Entity | None) -> str:
         """Return the name of the entity that a condition compares with."""
-        other = self.referenced_entity(element)
-        if other is agent:
-            raise self.values.error(element, f"'{other.name}' is compared with itself")
-        return other.name if other is entity and not other.ego else self.agent_name(other)
+        other_trigger = self.referenced_entity(element)
+        if other_trigger is agent:
+            raise self.values.error(element, f"'{other_trigger.name}' is compared with itself")
+        return (
+            other_trigger.name if other_trigger is entity and not other_trigger.ego else self.agent_name(other_trigger)
+        )
 
     def _point(self, position: Element | None, within: Element, agent: Entity) -> tuple[float, float]:
         """Return the point at which the centre of a body is when its reference point is at a position."""
@@ -316,9 +341,13 @@ class TriggerReader:
         """Return a trigger on a distance with the way in which a condition measures it."""
         free_space = self.values.truth(content, "freespace", default=False)
         distance_type = self.values.text(content, "relativeDistanceType", "")
-        along = distance_type == "longitudinal" or self.values.truth(content, "alongRoute", default=False)
-        along = along or self.values.text(content, "coordinateSystem", "entity") in ("lane", "road", "trajectory")
-        measure = "lateral" if distance_type == "lateral" else "road" if along else "straight"
+        is_along_road = distance_type == "longitudinal" or self.values.truth(content, "alongRoute", default=False)
+        is_along_road = is_along_road or self.values.text(content, "coordinateSystem", "entity") in (
+            "lane",
+            "road",
+            "trajectory",
+        )
+        measure = "lateral" if distance_type == "lateral" else "road" if is_along_road else "straight"
         return replace(trigger, free_space=free_space, measure=measure)  # type: ignore[arg-type]
 
     def _compared(self, trigger: PhaseTrigger, content: Element, label: str) -> Trigger:
@@ -337,9 +366,9 @@ class TriggerReader:
             return PhaseTrigger(all=(above, replace(trigger, value=value + EQUAL, rule="below")))
         return Unfulfilled.UNKNOWN
 
-    def _ego_distance(self, trigger: Trigger, agent: Entity, other: Entity) -> Trigger:
+    def _ego_distance(self, trigger: Trigger, agent: Entity, other_trigger: Entity) -> Trigger:
         """Return the trigger in its shorter form if it is on the distance of the centres of the ego and an actor."""
-        actors = [entity for entity in (agent, other) if not entity.ego]
+        actors = [entity for entity in (agent, other_trigger) if not entity.ego]
         if (
             isinstance(trigger, PhaseTrigger)
             and trigger.kind == "distance"

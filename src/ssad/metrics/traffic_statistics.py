@@ -27,7 +27,7 @@ QUEUE_START = 4  # first position in a queue whose headway counts as saturated (
 
 
 def begins(state: Bool) -> Bool:
-    """Return where a state [T, N] begins: it holds, and did not one step before. The first row never counts."""
+    """Return where a state [T, N] begins: it holds, and did not one step before. The first stay_row never counts."""
     starts = np.zeros_like(state)
     starts[1:] = state[1:] & ~state[:-1]
     return starts
@@ -46,33 +46,33 @@ def braking_onsets(acceleration: F64, present: Bool, threshold: float) -> int:
     return int((begins(acceleration < -threshold) & both).sum())
 
 
-def distance(speed: F64, present: Bool, dt: float) -> float:
-    """Return the metres that all vehicles travel together; speed [T, N] m/s, dt s."""
-    return float(np.abs(speed)[present].sum() * dt)
+def distance(speed: F64, present: Bool, time_step: float) -> float:
+    """Return the metres that all vehicles travel together; speed [T, N] m/s, time_step s."""
+    return float(np.abs(speed)[present].sum() * time_step)
 
 
-def jerk(acceleration: F64, present: Bool, dt: float) -> F64:
-    """Return the jerk of all vehicles in one row, m/s^3: differences of acceleration [T, N] over dt s."""
+def jerk(acceleration: F64, present: Bool, time_step: float) -> F64:
+    """Return the jerk of all vehicles in one stay_row, m/s^3: differences of acceleration [T, N] over time_step s."""
     both = present[1:] & present[:-1]
-    return np.asarray(np.diff(acceleration, axis=0)[both] / dt, np.float64)
+    return np.asarray(np.diff(acceleration, axis=0)[both] / time_step, np.float64)
 
 
-def lateral_acceleration(speed: F64, yaw: F64, present: Bool, dt: float) -> F64:
-    """Return the magnitude of the acceleration to the side in one row, m/s^2: speed times rate of turn.
+def lateral_acceleration(speed: F64, yaw: F64, present: Bool, time_step: float) -> F64:
+    """Return the magnitude of the acceleration to the side in one stay_row, m/s^2: speed times rate of turn.
 
     Args:
         speed: [T, N] m/s.
         yaw: [T, N] rad.
         present: [T, N].
-        dt: s.
+        time_step: s.
     """
     both = present[1:] & present[:-1]
-    rate = np.asarray(wrap_angle(np.diff(yaw, axis=0))) / dt
+    rate = np.asarray(wrap_angle(np.diff(yaw, axis=0))) / time_step
     return np.asarray(np.abs(0.5 * (speed[1:] + speed[:-1]) * rate)[both], np.float64)
 
 
 def time_gaps(gap: F64, speed: F64, present: Bool) -> F64:
-    """Return the time gaps of followers in one row, s: gap over speed, where it is below 5 s and they move.
+    """Return the time gaps of followers in one stay_row, s: gap over speed, where it is below 5 s and they move.
 
     Args:
         gap: [T, N] m from front bumper to the leader's rear; infinite without a leader.
@@ -161,7 +161,7 @@ def queue_discharge(since_green: F64, group: Ints, queued: Bool, *, least: int =
 
 @dataclass(frozen=True)
 class Visits:
-    """Stays of vehicles in cells of the ground, one row each, sorted by scene, cell and time.
+    """Stays of vehicles in cells of the ground, one stay_row each, sorted by scene, cell and time.
 
     Attributes:
         place: [V] number of scene and cell.
@@ -192,9 +192,9 @@ def visits(pose: F64, length: F64, scene: Ints, present: Bool, *, pause: int = 5
     half = 0.5 * length[vehicle]
     points = max(2, int(np.ceil(length.max(initial=1.0) / CELL)) + 1)
     share = np.linspace(-1.0, 1.0, points)
-    x, y, yaw = (pose[step, vehicle, axis] for axis in range(3))
-    columns = np.floor((x[:, None] + np.cos(yaw)[:, None] * half[:, None] * share) / CELL).astype(np.int64)
-    lines = np.floor((y[:, None] + np.sin(yaw)[:, None] * half[:, None] * share) / CELL).astype(np.int64)
+    east, north, yaw = (pose[step, vehicle, axis] for axis in range(3))
+    columns = np.floor((east[:, None] + np.cos(yaw)[:, None] * half[:, None] * share) / CELL).astype(np.int64)
+    lines = np.floor((north[:, None] + np.sin(yaw)[:, None] * half[:, None] * share) / CELL).astype(np.int64)
     place = ((scene[vehicle][:, None] << 40) + ((columns + (1 << 19)) << 20) + (lines + (1 << 19))).ravel()
     rows = np.stack([place, np.repeat(vehicle, points), np.repeat(step, points)], 1)
     rows, index = np.unique(rows, axis=0, return_index=True)
@@ -211,7 +211,7 @@ def visits(pose: F64, length: F64, scene: Ints, present: Bool, *, pause: int = 5
     return Visits(stay[:, 0], stay[:, 1], stay[:, 2], stay[:, 3], heading[order])
 
 
-def post_encroachment_times(stays: Visits, dt: float, *, longest: float = 10.0) -> F64:
+def post_encroachment_times(stays: Visits, time_step: float, *, longest: float = 10.0) -> F64:
     """Return the post-encroachment times of vehicles whose paths cross, s: one for each two vehicles, the least.
 
     It is the time from when one leaves a place until another, on a crossing path, comes there. Times above `longest`
@@ -222,16 +222,16 @@ def post_encroachment_times(stays: Visits, dt: float, *, longest: float = 10.0) 
     next_same = stays.place[1:] == stays.place[:-1]
     crossing = np.abs(np.asarray(wrap_angle(stays.yaw[1:] - stays.yaw[:-1]))) > CROSSES
     other = stays.vehicle[1:] != stays.vehicle[:-1]
-    time = np.maximum(stays.first[1:] - stays.last[:-1], 0) * dt
+    time = np.maximum(stays.first[1:] - stays.last[:-1], 0) * time_step
     rows = np.flatnonzero(next_same & crossing & other & (time <= longest))
     least: dict[tuple[int, int], float] = {}
-    for row in rows.tolist():
-        pair = (int(stays.vehicle[row]), int(stays.vehicle[row + 1]))
-        least[pair] = min(least.get(pair, math.inf), float(time[row]))
+    for stay_row in rows.tolist():
+        pair = (int(stays.vehicle[stay_row]), int(stays.vehicle[stay_row + 1]))
+        least[pair] = min(least.get(pair, math.inf), float(time[stay_row]))
     return np.array(sorted(least.values()))
 
 
-def gap_choices(stays: Visits, entries: Ints, dt: float, *, longest: float = 15.0) -> tuple[F64, F64]:
+def gap_choices(stays: Visits, entries: Ints, time_step: float, *, longest: float = 15.0) -> tuple[F64, F64]:
     """Return the gaps in crossing traffic that waiting vehicles accepted and rejected, s.
 
     A gap lies between two vehicles that come past the place where the waiting one's path crosses theirs; the first
@@ -240,27 +240,29 @@ def gap_choices(stays: Visits, entries: Ints, dt: float, *, longest: float = 15.
     Args:
         stays: Stays inside the junctions.
         entries: [E, 3] vehicle, step in which it began to wait before a junction, step in which it entered.
-        dt: s.
+        time_step: s.
         longest: Gaps above it, s, are left out: nobody had to choose.
     """
     accepted: list[float] = []
     rejected: list[float] = []
     for vehicle, waited, entered in entries.tolist():
-        path = np.flatnonzero((stays.vehicle == vehicle) & (stays.first >= entered) & (stays.first < entered + 15 / dt))
+        path = np.flatnonzero(
+            (stays.vehicle == vehicle) & (stays.first >= entered) & (stays.first < entered + 15 / time_step)
+        )
         moments: dict[int, int] = {}
-        for row in path.tolist():
-            low, high = np.searchsorted(stays.place, [stays.place[row], stays.place[row] + 1])
+        for stay_row in path.tolist():
+            low, high = np.searchsorted(stays.place, [stays.place[stay_row], stays.place[stay_row] + 1])
             for other in range(int(low), int(high)):
-                turn = abs(float(wrap_angle(stays.yaw[other] - stays.yaw[row])))
+                turn = abs(float(wrap_angle(stays.yaw[other] - stays.yaw[stay_row])))
                 name = int(stays.vehicle[other])
                 if name != vehicle and turn > CROSSES:
                     moments[name] = min(moments.get(name, 1 << 40), int(stays.first[other]))
         times = np.array(sorted(moment for moment in moments.values() if moment >= waited))
         before, after = times[times < entered], times[times >= entered]
         edges = np.append(waited, before)
-        rejected += (np.diff(edges) * dt).tolist()
+        rejected += (np.diff(edges) * time_step).tolist()
         if len(after):
-            accepted.append(float(after[0] - edges[-1]) * dt)
+            accepted.append(float(after[0] - edges[-1]) * time_step)
     return (
         np.array([gap for gap in accepted if gap <= longest]),
         np.array([gap for gap in rejected if 0.0 < gap <= longest]),

@@ -184,7 +184,7 @@ BAD = [
     ("${slow + 1}", "${slow + 90}", r"phases\[0\].speed: 95 is outside .* \(the value of '\$\{slow \+ 90\}'\)"),
     ("  slow:", "  target_speed:", "parameters.target_speed: 'target_speed' has a meaning of its own"),
     ("  slow:", "  a-b:", "the name of a parameter has letters"),
-    ("ego_speed: ego", "ego_speed: 2 * ego", "parameters.ego_speed: .* is outside"),
+    ("ego_speed: ego", "ego_speed: 5 * ego", "parameters.ego_speed: .* is outside"),
     ("  ego_speed: ego", "  speed: 3", r"no such parameter; Custom has: ego_speed.*write speed: \{value: 3\}"),
 ]
 

@@ -66,15 +66,15 @@ def test_a_turn_around_a_small_island_keeps_its_direction() -> None:
 
 
 def test_the_centre_has_the_same_distance_from_both_bounds(tmp_path: Path) -> None:
-    """In a bend whose inner bound has fewer points than the outer one."""
-    angles = np.linspace(0.0, 1.4, 30)
+    """In a lane that widens to one side by a slope of 8 m in 20 m."""
     road = MapWriter()
-    inner = [(float(16 * np.cos(a)), float(16 * np.sin(a))) for a in angles[::3]] + [
-        (float(16 * np.cos(1.4)), float(16 * np.sin(1.4)))
-    ]
-    road.lanelet(inner, [(float(20 * np.cos(a)), float(20 * np.sin(a))) for a in angles])
+    road.lanelet(straight(0, 40, 2), [(0.0, -2.0), (20.0, -2.0), (40.0, -10.0)])
     graph = town(tmp_path, road)
-    assert np.abs(np.hypot(*graph.xy.T) - 18.0).max() < 0.05
+    x, y = graph.xy[(graph.xy[:, 0] > 22.0) & (graph.xy[:, 0] < 36.0)].T
+    slope = np.array([20.0, -8.0]) / np.hypot(20.0, 8.0)
+    to_right = slope[0] * (y + 2.0) - slope[1] * (x - 20.0)
+    assert len(x) > 5
+    assert np.abs(0.5 * ((2.0 - y) - to_right)).max() < 0.05
 
 
 def test_a_centre_line_of_the_file_is_taken(tmp_path: Path) -> None:
@@ -281,8 +281,43 @@ def test_lanes_that_cross_form_a_junction_and_its_light_has_a_stop_line(tmp_path
     light = int(graph.stop_signal[graph.stop_lane == 0][0])
     assert light in real
     assert graph.signal_xy[light].tolist() == [6.0, 3.5]
-    assert graph.stop_s[graph.stop_lane == 0].tolist() == pytest.approx([48.0])
+    assert graph.stop_s[graph.stop_lane == 0].tolist() == pytest.approx([28.0])
     assert graph.signal_phase[light] != graph.signal_phase[graph.stop_signal[graph.stop_lane == 3][0]]
+
+
+def test_short_forks_form_a_junction_and_long_ones_do_not(tmp_path: Path) -> None:
+    for length, junction in ((40.0, [-1, 1, 1]), (140.0, [-1, -1, -1])):
+        road = MapWriter()
+        road.lanelet(straight(-50, 0, 2), straight(-50, 0, -2))
+        for y in (0.0, 12.0):
+            road.lanelet([(0.0, 2.0), (length, y + 2.0)], [(0.0, -2.0), (length, y - 2.0)])
+        graph = town(tmp_path, road)
+        assert graph.junction.tolist() == junction
+        assert graph.successors(0).tolist() == [1, 2]
+
+
+def test_headings_have_no_step_where_lanes_follow_each_other(tmp_path: Path) -> None:
+    road = MapWriter()
+    road.lanelet(straight(0, 30, 2), straight(0, 30, -2))
+    road.lanelet([(30.0, 2.0), (58.0, 12.0)], [(30.0, -2.0), (60.0, 8.0)])
+    graph = town(tmp_path, road)
+    end, start = graph.yaw[graph.points(0)][-1], graph.yaw[graph.points(1)][0]
+    assert end == pytest.approx(start)
+    assert 0.05 < end < 0.3
+
+
+def test_right_of_way_of_one_turn_alone_makes_no_sign(tmp_path: Path) -> None:
+    road, report = with_rule("right_of_way", "", "yield"), ImportReport("map")
+    road.relations = [text.replace('role="yield"', 'role="of"') for text in road.relations]
+    turn = road.lanelet([(-2.0, -10.0), (-10.0, -4.0)], [(2.0, -10.0), (-8.0, 0.0)])
+    road.relations.append(
+        f'<relation id="900"><member type="relation" ref="{turn}" role="yield"/>'
+        '<tag k="type" v="regulatory_element"/><tag k="subtype" v="right_of_way"/></relation>'
+    )
+    graph = town(tmp_path, road, report)
+    assert graph.junction[-1] >= 0
+    assert graph.rule_lane.tolist() == []
+    assert report.omissions["right of way of single turns, or at traffic lights"] == [f"lanelet {turn}"]
 
 
 def test_lanes_at_other_heights_do_not_cross(tmp_path: Path) -> None:

@@ -38,30 +38,33 @@ WANDER = wp.constant(0.05)  # m of it
 
 
 @wp.func
-def driver_follows(v: float, lead: float, gap: float, style: wp.vec4) -> float:
-    """Return the reaction to a leader `gap` metres ahead that drives at `lead` m/s."""
-    closing = v * (v - lead) / (2.0 * wp.sqrt(style[2] * style[3]))
-    ratio = (style[1] + wp.max(0.0, v * style[0] + closing)) / wp.max(gap, 0.1)
+def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.vec4) -> float:
+    """Return the reaction to a leader `gap` metres ahead that drives at `leader_speed` m/s."""
+    closing = own_speed * (own_speed - leader_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
+    ratio = (style[1] + wp.max(0.0, own_speed * style[0] + closing)) / wp.max(gap, 0.1)
     wish = style[2] * (1.0 - ratio * ratio)
     room = wp.max(gap - LAST_GAP, 0.2)
-    slower = wp.max(v - lead, 0.0)
-    need = wp.max(slower * slower / (2.0 * room), v * v / (2.0 * (room + lead * lead / (2.0 * LEADER_BRAKES))))
+    slower = wp.max(own_speed - leader_speed, 0.0)
+    need = wp.max(
+        slower * slower / (2.0 * room),
+        own_speed * own_speed / (2.0 * (room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
+    )
     return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - style[2]
 
 
 @wp.func
-def driver_stops(v: float, distance: float, style: wp.vec4) -> float:
+def driver_stops(own_speed: float, distance: float, style: wp.vec4) -> float:
     """Return the reaction to a place `distance` metres ahead of the front, before which the driver stops.
 
     It comes to rest about the standstill gap before the place, with the comfortable deceleration if there is time.
     """
     room = wp.max(distance - 0.8 * style[1], 0.3)
-    need = v * v / (2.0 * room)
+    need = own_speed * own_speed / (2.0 * room)
     share = need / style[3]
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
         # who is late stops nearer to the place
-        late = v * v / (2.0 * wp.max(distance - LAST_GAP, 0.3))
+        late = own_speed * own_speed / (2.0 * wp.max(distance - LAST_GAP, 0.3))
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if distance < style[1]:
         ratio = style[1] / wp.max(distance, 0.1)
@@ -70,14 +73,14 @@ def driver_stops(v: float, distance: float, style: wp.vec4) -> float:
 
 
 @wp.func
-def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
+def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
-    need = v * v / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
+    need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
     allowed = style[2] - (style[2] + style[3]) * share * share
     if share > 1.0:
-        late = v * v / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
-        if v < CREEPS:
+        late = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
+        if own_speed < CREEPS:
             late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
@@ -86,10 +89,10 @@ def driver_yields(v: float, gap: float, style: wp.vec4) -> float:
 
 
 @wp.func
-def driver_speed(roads: Roads, route: wp.vec2i, at: int, v: float, pace: float, deceleration: float) -> float:
+def driver_speed(roads: Roads, route: wp.vec2i, at: int, own_speed: float, pace: float, deceleration: float) -> float:
     """Return the speed from which the driver reaches every bend ahead at its speed there, slowing down early."""
     slope = 2.0 * SLOWING * deceleration
-    reach = wp.min(v * v / slope + 8.0, LOOKS)
+    reach = wp.min(own_speed * own_speed / slope + 8.0, LOOKS)
     target = pace * roads.rule[route[0] + at][0]
     for sample in range(SAMPLES):
         metres = int(reach * float(sample + 1) / float(SAMPLES))
@@ -100,22 +103,22 @@ def driver_speed(roads: Roads, route: wp.vec2i, at: int, v: float, pace: float, 
 
 
 @wp.func
-def driver_accelerates(v: float, target: float, style: wp.vec4) -> float:
+def driver_accelerates(own_speed: float, target: float, style: wp.vec4) -> float:
     """Return the acceleration on a free road, m/s^2; above the target speed a smooth return to it."""
-    if v > target:
-        return wp.max(-1.5 * (v - target), -style[3])
-    ratio = v / wp.max(target, 0.1)
+    if own_speed > target:
+        return wp.max(-1.5 * (own_speed - target), -style[3])
+    ratio = own_speed / wp.max(target, 0.1)
     return style[2] * (1.0 - ratio * ratio * ratio * ratio)
 
 
 @wp.func
-def slow_noise(key: int, time: float, period: float) -> float:
+def slow_noise(noise_key: int, time: float, period: float) -> float:
     """Return a standard normal number that changes over `period` s: a function of key and time alone."""
     place = time / period
     first = int(place)
     share = place - float(first)
-    before = wp.randn(wp.rand_init(key, first))
-    after = wp.randn(wp.rand_init(key, first + 1))
+    before = wp.randn(wp.rand_init(noise_key, first))
+    after = wp.randn(wp.rand_init(noise_key, first + 1))
     share = share * share * (3.0 - 2.0 * share)
     mixed = before + share * (after - before)
     # a mixture of two is narrower than each of them
@@ -159,7 +162,7 @@ def delay(reaction_time: float, speed: float, junction: float) -> float:
 
 
 @wp.func
-def pedal_change(demand: float, accel: float, jerk: float, dt: float) -> float:
+def pedal_change(demand: float, accel: float, jerk: float, time_step: float) -> float:
     """Return the acceleration to which a driver comes in a step, from `accel` towards `demand`."""
     down = jerk * wp.clamp(-demand / HASTE, 1.0, 6.0)
-    return wp.clamp(demand, accel - down * dt, accel + jerk * dt)
+    return wp.clamp(demand, accel - down * time_step, accel + jerk * time_step)
