@@ -11,6 +11,7 @@ import pytest
 from helpers.command import ssad
 from helpers.openscenario import by_entity, by_time, document, event, lane_position, speed_action, start, write
 
+from ssad.core.errors import FormatError
 from ssad.core.types import Controller, EpisodeTrace, LateralPhase, Phase, PhaseTrigger, Scenario
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario, read_openscenario_set
@@ -248,6 +249,14 @@ def test_a_trigger_that_never_fires_is_named_with_its_line(condition: str, reaso
     assert refused.returncode == 2
     assert len(refused.stderr.splitlines()) == 1
     assert not (tmp_path / "out.yaml").exists()
+
+
+def test_long_chains_of_waiting_events_are_refused(tmp_path: Path) -> None:
+    show = '<VisibilityAction graphics="true" traffic="true" sensors="true"/>'
+    events = [event("brake", speed_action(3, "linear", "rate", 4), state("0", "event", "completeState"))]
+    events += [event(f"{number}", show, state(f"{number + 1}", "event", "startTransition")) for number in range(300)]
+    with pytest.raises(FormatError, match=r"test\.xosc:\d+: Storyboard\w*: '\d+' ends a chain of more than 50 events"):
+        actor_of(tmp_path, *events, event("300", show, by_time(2)))
 
 
 def test_what_is_not_carried_over_is_listed_and_strict_refuses_it(tmp_path: Path) -> None:

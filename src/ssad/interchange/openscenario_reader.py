@@ -135,7 +135,10 @@ def read_openscenario_set(
         if key not in maps:
             maps[key] = find_map(resolved, source, report) if map_name is None else DocumentMap(map_name)
         reader = _Reader(source, resolved, parameters, maps[key], report)
-        scenario = reader.read(source.stem, f"/{index + 1:04d}" if is_set else "")
+        try:
+            scenario = reader.read(source.stem, f"/{index + 1:04d}" if is_set else "")
+        except RecursionError:
+            raise FormatError(f"{source}: its conditions are nested too deeply; split them into several events") from None
         scenarios.append(scenario)
         if progress is not None:
             progress(index + 1, len(sets))

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 LATERAL_TIME: Final = 3.0  # s of a lateral motion whose dynamics the file does not limit
+MAX_WAITING: Final = 50  # events that wait for each other, in a chain
 MAX_PROFILE: Final = 12  # phases of a speed profile
 _KINDS: Final = ("Story", "Act", "ManeuverGroup", "Maneuver", "Event", "Action")
 _SHAPES: Final = ("linear", "sinusoidal", "cubic", "step")
@@ -370,6 +371,8 @@ class StoryboardReader:
             return self._starts[key]
         if key in self._open:
             return self.triggers.never(content, label, "events wait for each other")
+        if len(self._open) >= MAX_WAITING:
+            raise self.values.error(content, f"'{label}' ends a chain of more than {MAX_WAITING} events that wait")
         self._open.add(key)
         try:
             result = make()
