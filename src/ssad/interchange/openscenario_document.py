@@ -147,7 +147,9 @@ class Scope:
             ring = " -> ".join([*self._open[self._open.index(name) :], name])
             raise error_at(declaration, f"the parameter depends on itself: {ring[:200]}")
         if len(self._open) >= MAX_REFERENCES:
-            raise error_at(declaration, f"parameter '{name[:60]}' ends a chain of more than {MAX_REFERENCES} parameters")
+            raise error_at(
+                declaration, f"parameter '{name[:60]}' ends a chain of more than {MAX_REFERENCES} parameters"
+            )
         self._open.append(name)
         try:
             text = self.assigned.get(name)
