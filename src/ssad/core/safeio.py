@@ -424,8 +424,8 @@ def parse_xml(
     for _ in range(MAX_XML_DEPTH):
         level = [child for element in level for child in element]
     if level:
-        line = getattr(level[0], "line", None)
-        place = name if line is None else f"{name}:{line}"
+        line_number: int | None = getattr(level[0], "line", None)
+        place = name if line_number is None else f"{name}:{line_number}"
         raise FormatError(f"{place}: <{level[0].tag[:40]}> is nested deeper than {MAX_XML_DEPTH} levels")
     return root
 
