@@ -26,7 +26,7 @@ JOIN = 1.0  # m within which ends of sidewalks and crossings are one node
 REACH = 6.0  # m from the end of a crosswalk to the sidewalk that it leads to
 SETBACK = 2.0  # m from the end of a sidewalk at a junction to an unmarked crossing
 BESIDE = 25.0  # m of a road around a crosswalk without an unmarked crossing
-GAP = 20.0  # m between ends of sidewalks that a map does not connect at a junction, though no lane lies between them
+GAP = 32.0  # m between ends of sidewalks that a map does not connect at a junction, though no lane lies between them
 MAX_LENGTH = 35.0  # m from sidewalk to sidewalk; wider roads are not crossed in one go
 MAX_SPEED_LIMIT = (
     65.0 / 3.6
