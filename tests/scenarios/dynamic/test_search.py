@@ -116,7 +116,7 @@ def test_a_scenario_without_parameters_of_others_is_told_in_a_line(base: Base) -
     custom = dataclasses.replace(base.scenario, type="Custom", parameters={})
     with pytest.raises(
         ConfigError,
-        match="no parameters of other agents to search; declare some with a range .* king and cat",
+        match=r"no parameters of other agents to search; declare some with a range .* king and cat",
     ):
         ParameterBox.of(custom)
 
