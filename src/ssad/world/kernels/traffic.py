@@ -28,8 +28,8 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
     RUNS_RED,
-    YIELD_LEAST,
     STOPS_AT_YELLOW,
+    YIELD_LEAST,
     driver_follows,
     driver_speed,
     driver_stops,
