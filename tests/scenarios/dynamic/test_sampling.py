@@ -86,7 +86,7 @@ LATER |= {"position": None, "rule": "", "edge": "none", "delay": 0.0, "free_spac
 LATER |= {"all": (), "any": ()}
 LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
 LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
-LATER |= {"elsewhere": "program"}
+LATER |= {"elsewhere": "program", "driver": None, "drivers": "uniform", "errors": 0.0, "walkers": 0, "cyclists": 0}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

@@ -29,6 +29,7 @@ from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
     RUNS_RED,
     STOPS_AT_YELLOW,
+    YIELD_LEAST,
     driver_follows,
     driver_speed,
     driver_stops,
@@ -64,6 +65,13 @@ STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
+MARGIN = wp.constant(2)  # strides between a driver that gives way and who comes after it
+MOST_MARGIN = wp.constant(6)  # strides of it at most, with what the other may gain
+LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
+INSIDE = wp.constant(5.0)  # m beyond its line in which a driver still stops for somebody in the junction
+STILL_STOPS = wp.constant(5.0)  # m/s^2 of who brakes for the conflict already
+BRAKES = wp.constant(1.0)  # m/s^2
+COMMITTED = wp.constant(3.0)  # m/s^2: who would have to brake harder before a conflict goes on
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
 
@@ -220,9 +228,17 @@ def is_waiting(
     way = perceived.way[b, i]
     speed = perceived.speed[b, i]
     line = way[0] - perceived.half[b, i][0]
-    yields = speed * speed < 8.0 * (wp.max(line, 0.0) + 1.5)
     index = perceived.signal[b, i]
     turns = perceived.way[b, j][2] > way[2]
+    expected = float(4.0)
+    room = wp.max(line, 0.0) + 1.5
+    if i < bank.style.shape[1]:
+        if bank.style[e, i][0] > 0.0:
+            if turns:
+                expected = LETS_TURN
+            else:
+                room = room + INSIDE
+    yields = speed * speed < 2.0 * expected * room
     if turns and index >= 0 and wp.cos(perceived.pose[b, i][2] - perceived.pose[b, j][2]) < -0.5:
         if light(bank, roads, state, perceived, b, me, e, index, dt) == SignalState.GREEN:
             yields = False
@@ -335,6 +351,51 @@ def forecast_pose(perceived: PerceivedAgents, b: int, j: int, index: int) -> wp.
 
 
 @wp.func
+def corridor_edge(
+    roads: Roads,
+    perceived: PerceivedAgents,
+    b: int,
+    j: int,
+    route: wp.vec2i,
+    shift: wp.vec4,
+    u0: float,
+    own_half: wp.vec2,
+    other_half: wp.vec2,
+    places: wp.vec2i,
+    limit: float,
+) -> float:
+    """Return the metres up to `limit` that i can go on without a body in the stretch that j is about to drive through.
+
+    places: first and last index of j's forecast; -1 is its place now.
+    """
+    edge = limit
+    for metre in range(int(limit) + 1):
+        frame = way_frame(roads, route[0], route[1], shift, u0 + float(metre))
+        touches = bool(False)
+        for place in range(places[0], places[1] + 1):
+            other_pose = perceived.pose[b, j]
+            if place >= 0:
+                other_pose = forecast_pose(perceived, b, j, place)
+            if frames_touch(
+                other_pose[0] - frame[0],
+                other_pose[1] - frame[1],
+                frame[2],
+                frame[3],
+                own_half[0],
+                own_half[1],
+                wp.cos(other_pose[2]),
+                wp.sin(other_pose[2]),
+                other_half[0],
+                other_half[1],
+            ):
+                touches = bool(True)
+        if touches:
+            edge = wp.max(float(metre) - 1.0, 0.0)
+            break
+    return edge
+
+
+@wp.func
 def conflict_gap(
     roads: Roads,
     perceived: PerceivedAgents,
@@ -351,14 +412,24 @@ def conflict_gap(
     pace: float,
     pick_up: float,
     extra: int,
-) -> wp.vec2:
+    margin_strides: int,
+    other_accel: float,
+) -> wp.vec3:
     """Return the distance from i's front bumper to its predicted conflict with j, or FAR, and the time until then, s.
+
+    The third number is the distance to a conflict with j half a second or more after i; it counts only where
+    `margin_strides` > 0, and then the first one leaves it out.
 
     i is predicted along its intention, j along its own route at constant speed (along its heading if it has none);
     they are compared at the same time and half a second to either side. The distance is to the near edge of the
-    conflict.
+    conflict. Who gives way asks for `margin_strides` more between itself and j, which may go on to gain speed at
+    `other_accel` m/s^2.
     """
     gap = FAR
+    late_gap = FAR
+    first_place = int(HORIZON) + 99
+    last_place = int(-1)
+    other_speed = wp.max(wp.abs(perceived.speed[b, j]), 1.0)
     first_time = FAR
     along = float(0.0)
     speed = v
@@ -382,12 +453,19 @@ def conflict_gap(
         later = now
         if step + 1 < strides:
             later = forecast_pose(perceived, b, j, step + 1)
-        for moment in range(3):
+        moments = int(3)
+        if margin_strides > 0:
+            time = STRIDE * float(step + 1)
+            gained = 0.5 * other_accel * time * time / (other_speed * STRIDE)
+            moments = 3 + wp.min(margin_strides + int(gained + 0.5), MOST_MARGIN)
+        for moment in range(moments):
             other_pose = now
             if moment == 0:
                 other_pose = before
             elif moment == 2:
                 other_pose = later
+            elif moment > 2:
+                other_pose = forecast_pose(perceived, b, j, step - 1 + moment)
             rel_x = other_pose[0] - frame[0]
             rel_y = other_pose[1] - frame[1]
             if rel_x * rel_x + rel_y * rel_y < squared_reach:
@@ -406,11 +484,35 @@ def conflict_gap(
                     edge = along + longitudinal - half_along - own_body[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
-                        gap = wp.min(gap, wp.max(edge, 0.0))
+                        first_place = wp.min(first_place, step - 1 + moment)
+                        last_place = wp.max(last_place, step - 1 + moment)
+                        if margin_strides > 0 and moment > 1:
+                            late_gap = wp.min(late_gap, wp.max(edge, 0.0))
+                        else:
+                            gap = wp.min(gap, wp.max(edge, 0.0))
                         first_time = wp.min(first_time, STRIDE * float(step))
         before = now
         now = later
-    return wp.vec2(gap, first_time)
+    nearest = wp.min(gap, late_gap)
+    if margin_strides > 0 and nearest < FAR:
+        edge = corridor_edge(
+            roads,
+            perceived,
+            b,
+            j,
+            route,
+            shift,
+            u0,
+            wp.vec2(own_body[0], own_body[1] + lat_margin),
+            wp.vec2(half_length, other_body[1]),
+            wp.vec2i(wp.max(first_place - 1, -1), last_place + 1),
+            nearest,
+        )
+        if gap < FAR:
+            gap = wp.min(gap, edge)
+        if late_gap < FAR:
+            late_gap = wp.min(late_gap, edge)
+    return wp.vec3(gap, first_time, late_gap)
 
 
 @wp.func
@@ -735,8 +837,18 @@ def react_to_agents(
             if walks:
                 margin = 1.0
             pick_up = float(PICKS_UP)
+            goes_first = bool(False)
+            margin_strides = int(0)
+            other_accel = float(0.0)
             if style[0] > 0.0:
                 pick_up = 0.8 * style[2]
+                goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
+                goes_first = change_priority(perceived, b, i, j, goes_first)
+                crosses = wp.abs(wp.sin(other_pose[2] - pose[2])) > 0.5 or wp.cos(other_pose[2] - pose[2]) < -0.5
+                if not goes_first and not walks and crosses:
+                    margin_strides = MARGIN
+                    if j < agents:
+                        other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
             conflict = conflict_gap(
                 roads,
                 perceived,
@@ -753,8 +865,16 @@ def react_to_agents(
                 bank.manner[e, i][0],
                 pick_up,
                 looks_longer(row(roads.rule, first), offset, own_body[0], speed, style),
+                margin_strides,
+                other_accel,
             )
             gap = conflict[0]
+            # who can still stop before a conflict leaves a margin; who is beyond that goes on, and clears it
+            committed = float(COMMITTED)
+            if state.accel[b, i] < -BRAKES:
+                committed = STILL_STOPS
+            if conflict[2] < gap and speed * speed < 2.0 * committed * wp.max(conflict[2] - YIELD_LEAST, 0.1):
+                gap = conflict[2]
             if gap < FAR:
                 near = 0.5 * speed
                 if style[0] > 0.0:
@@ -762,8 +882,9 @@ def react_to_agents(
                     other_speed = wp.abs(perceived.speed[b, j])
                     if other_speed * (conflict[1] - other_speed / (2.0 * RELIES)) < 0.5:
                         near = FAR
-                goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
-                goes_first = change_priority(perceived, b, i, j, goes_first)
+                else:
+                    goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
+                    goes_first = change_priority(perceived, b, i, j, goes_first)
                 at_line = bool(False)
                 if judgement[1] > 0.0:
                     goes_first = True  # an error: it does not look who has priority
