@@ -12,7 +12,7 @@ from helpers.command import ssad
 from helpers.openscenario import by_entity, by_time, document, event, lane_position, speed_action, start, write
 
 from ssad.core.errors import FormatError
-from ssad.core.types import Controller, EpisodeTrace, Gap, LateralPhase, Phase, PhaseTrigger, Scenario
+from ssad.core.types import Controller, EpisodeTrace, FollowingGap, LateralPhase, Phase, PhaseTrigger, Scenario
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario, read_openscenario_set
 from ssad.scenarios.dynamic import build_episode
@@ -274,7 +274,7 @@ def test_a_distance_to_another_entity_is_kept(tmp_path: Path) -> None:
     behind = keep(limits, distance="25", displacement="trailingReferencedEntity")
     starts = start("Ego", lane_position(-1, 40), 15) + start("Target", lane_position(-2, 10), 15)
     imported = read_openscenario(write(tmp_path, document(starts, event("keep", behind, by_time(1)), stop=by_time(12))))
-    gap = Gap(25.0, free_space=True, max_acceleration=2.0, max_deceleration=3.0, max_speed=30.0)
+    gap = FollowingGap(25.0, free_space=True, max_acceleration=2.0, max_deceleration=3.0, max_speed=30.0)
     assert imported.scenario.actors[0].phases == (
         Phase(when=PhaseTrigger("time", 1.0), name="keep", continuous=True, gap=gap),
     )
@@ -294,10 +294,10 @@ def test_a_distance_without_limits_is_there_at_the_start(tmp_path: Path) -> None
     actor = read_openscenario(write(tmp_path, document(starts))).scenario.actors[0]
     assert actor.pose.x == pytest.approx(20.0 + 2.0 * 10.0 + 1.4)
     (phase,) = actor.phases
-    assert phase.gap == Gap(time=2.0, side="ahead")
+    assert phase.gap == FollowingGap(time=2.0, side="ahead")
     starts = start("Ego", lane_position(-1, 20), 15) + start("Target", lane_position(-2, 100), 10)
     late = read_openscenario(write(tmp_path, document(starts, event("late", keep(distance="9"), by_time(2)))))
-    assert late.scenario.actors[0].phases[0].gap == Gap(9.0, free_space=True, side="any")
+    assert late.scenario.actors[0].phases[0].gap == FollowingGap(9.0, free_space=True, side="any")
     assert late.doubts == ("LongitudinalDistanceAction in event 'late': 'Target' drives there, it does not jump",)
 
 

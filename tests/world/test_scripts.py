@@ -20,7 +20,7 @@ from ssad.core.types import (
     Episode,
     EpisodeAgent,
     EpisodeLimits,
-    Gap,
+    FollowingGap,
     LateralPhase,
     Phase,
     PhaseTrigger,
@@ -131,12 +131,12 @@ FASTER = Phase(14.0, PhaseTrigger("time", 20.0), acceleration=2.0)
 WITHIN = {"max_acceleration": 2.0, "max_deceleration": 3.0}
 # place at the start, speed there, gap, whether it is continuous; the leader starts at 150 m with 15 m/s
 GAPS = {
-    "far": (20.0, 20.0, Gap(20.0, **WITHIN), True),
-    "near": (140.0, 15.0, Gap(40.0, max_speed=16.0, **WITHIN), True),
-    "free": (110.0, 15.0, Gap(20.0, free_space=True), True),
-    "headway": (115.0, 15.0, Gap(2.0, time=1.5, **WITHIN), True),
-    "ahead": (160.0, 15.0, Gap(20.0, side="any"), True),
-    "once": (110.0, 15.0, Gap(20.0), False),
+    "far": (20.0, 20.0, FollowingGap(20.0, **WITHIN), True),
+    "near": (140.0, 15.0, FollowingGap(40.0, max_speed=16.0, **WITHIN), True),
+    "free": (110.0, 15.0, FollowingGap(20.0, free_space=True), True),
+    "headway": (115.0, 15.0, FollowingGap(2.0, time=1.5, **WITHIN), True),
+    "ahead": (160.0, 15.0, FollowingGap(20.0, side="any"), True),
+    "once": (110.0, 15.0, FollowingGap(20.0), False),
 }
 
 

@@ -269,7 +269,7 @@ class Arrival:
 
 
 @dataclass(frozen=True)
-class Gap:
+class FollowingGap:
     """Distance along the road that an actor keeps to another agent: `distance` plus `time` times a speed.
 
     The speed is that of whoever is behind, which makes `time` a time headway. The limits are those of the actor's
@@ -338,7 +338,7 @@ class Phase:
     continuous: bool = False
     arrival: Arrival | None = None
     anytime: bool = False
-    gap: Gap | None = None
+    gap: FollowingGap | None = None
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ssad.core.import_report import ImportReport
-from ssad.core.types import Arrival, Gap, LateralPhase, Phase, PhaseTrigger, Pose
+from ssad.core.types import Arrival, FollowingGap, LateralPhase, Phase, PhaseTrigger, Pose
 from ssad.interchange.openscenario_entities import Entity
 from ssad.interchange.openscenario_places import PositionReader
 from ssad.interchange.openscenario_trajectories import SampledTrajectory
@@ -808,7 +808,7 @@ class StoryboardReader:
             distance = max(distance + (back if side == "behind" else -back), 0.0)
         if distance <= 0.0 and time <= 0.0:
             distance = 0.01  # a distance of 0 between reference points
-        gap = Gap(
+        gap = FollowingGap(
             max(distance, 0.0),
             max(time, 0.0),
             self.triggers.agent_name(other),

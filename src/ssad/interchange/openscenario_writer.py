@@ -25,7 +25,7 @@ from ssad.core.types import (
     Episode,
     EpisodeAgent,
     EpisodeLimits,
-    Gap,
+    FollowingGap,
     LateralPhase,
     Model,
     Phase,
@@ -380,7 +380,7 @@ class _Writer:
             continuous=phase.continuous,
         )
 
-    def _write_gap(self, parent: Element, phase: Phase, gap: Gap, limits: Model) -> None:
+    def _write_gap(self, parent: Element, phase: Phase, gap: FollowingGap, limits: Model) -> None:
         displacement = {"behind": "trailingReferencedEntity", "ahead": "leadingReferencedEntity"}
         action = _node(
             parent,

@@ -16,7 +16,7 @@ from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
-    Gap,
+    FollowingGap,
     LateralPhase,
     Phase,
     PhaseTrigger,
@@ -214,7 +214,7 @@ class ScriptTables:
         return scripts
 
 
-def _gap_rows(gap: Gap) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _gap_rows(gap: FollowingGap) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the rows of `Scripts.meeting` and `Scripts.other_meeting` of a gap."""
     limits = (gap.max_acceleration, gap.max_deceleration, gap.max_speed)
     return (

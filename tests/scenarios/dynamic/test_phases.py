@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, RouteError
-from ssad.core.types import Arrival, Controller, Gap, LateralPhase, Phase, PhaseTrigger
+from ssad.core.types import Arrival, Controller, FollowingGap, LateralPhase, Phase, PhaseTrigger
 from ssad.scenarios.dynamic import build_episode, read_scenarios, save_scenarios, scenario_from
 from ssad.world.roads import load_town
 from ssad.world.world import World
@@ -63,7 +63,7 @@ def test_a_file_with_all_kinds_of_phases(tmp_path: Path) -> None:
     )
     assert meeting.phases == (
         Phase(3.0, arrival=Arrival((260.0, -7.0), (257.0, -5.25))),
-        Phase(gap=Gap(time=1.5, reference="cutter", max_speed=5.0), continuous=True),
+        Phase(gap=FollowingGap(time=1.5, reference="cutter", max_speed=5.0), continuous=True),
     )
     save_scenarios(tmp_path / "again.yaml", scenario)
     assert read_scenarios(tmp_path / "again.yaml") == (scenario,)

@@ -17,7 +17,7 @@ from ssad.core.triggers import (
     default_rule,
     trigger_groups,
 )
-from ssad.core.types import Actor, Gap, LateralPhase, Phase, PhaseTrigger
+from ssad.core.types import Actor, FollowingGap, LateralPhase, Phase, PhaseTrigger
 
 MAX_ACCELERATION: Final = 100.0  # m/s^2
 MAX_DELAY: Final = 600.0  # s
@@ -133,7 +133,7 @@ def _speed_problems(
 def _gap_problems(
     phase: Phase, place: Place, actors: Sequence[Actor], actor: Actor, max_speed: float
 ) -> Iterator[Problem]:
-    gap = phase.gap or Gap()
+    gap = phase.gap or FollowingGap()
     for key in _WITHOUT_GAP:
         if getattr(phase, key) != getattr(Phase, key):
             yield (*place, key), "a gap determines the speed; leave it out (limits stand in the gap)"
