@@ -12,7 +12,7 @@ from helpers.command import ssad
 from helpers.openscenario import by_entity, by_time, document, event, lane_position, speed_action, start, write
 
 from ssad.core.errors import FormatError
-from ssad.core.types import Controller, EpisodeTrace, LateralPhase, Phase, PhaseTrigger, Scenario
+from ssad.core.types import Controller, EpisodeTrace, Gap, LateralPhase, Phase, PhaseTrigger, Scenario
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario, read_openscenario_set
 from ssad.scenarios.dynamic import build_episode
@@ -257,6 +257,48 @@ def test_long_chains_of_waiting_events_are_refused(tmp_path: Path) -> None:
     events += [event(f"{number}", show, state(f"{number + 1}", "event", "startTransition")) for number in range(300)]
     with pytest.raises(FormatError, match=r"test\.xosc:\d+: Storyboard\w*: '\d+' ends a chain of more than 50 events"):
         actor_of(tmp_path, *events, event("300", show, by_time(2)))
+
+
+def keep(limits: str = "", **attributes: str) -> str:
+    stated = {"entityRef": "Ego", "freespace": "true", "continuous": "true"} | attributes
+    text = " ".join(f'{name}="{value}"' for name, value in stated.items())
+    return (
+        f"<LongitudinalAction><LongitudinalDistanceAction {text}>{limits}</LongitudinalDistanceAction>"
+        "</LongitudinalAction>"
+    )
+
+
+def test_a_distance_to_another_entity_is_kept(tmp_path: Path) -> None:
+    """As a gap with the limits of the file; the target falls back to it, and the exported file drives as this one."""
+    limits = '<DynamicConstraints maxAcceleration="2" maxDeceleration="3" maxSpeed="30"/>'
+    behind = keep(limits, distance="25", displacement="trailingReferencedEntity")
+    starts = start("Ego", lane_position(-1, 40), 15) + start("Target", lane_position(-2, 10), 15)
+    imported = read_openscenario(write(tmp_path, document(starts, event("keep", behind, by_time(1)), stop=by_time(12))))
+    gap = Gap(25.0, free_space=True, max_acceleration=2.0, max_deceleration=3.0, max_speed=30.0)
+    assert imported.scenario.actors[0].phases == (
+        Phase(when=PhaseTrigger("time", 1.0), name="keep", continuous=True, gap=gap),
+    )
+    assert imported.doubts == ()
+    files, _ = export_openscenario([imported.scenario], tmp_path / "out")
+    again = read_openscenario(next(path for path in files if path.suffix == ".xosc"))
+    assert again.scenario.actors[0].phases[0].gap == gap
+    trace = drive(imported.scenario, 15.0)
+    assert trace.x[-1, 0] - trace.x[-1, 1] == pytest.approx(25.0 + LENGTH, abs=0.05)
+
+
+def test_a_distance_without_limits_is_there_at_the_start(tmp_path: Path) -> None:
+    """Between reference points and in time; in the middle of an episode nobody jumps, which is a doubt."""
+    ahead = keep(timeGap="2", freespace="false", displacement="leadingReferencedEntity")
+    starts = start("Ego", lane_position(-1, 20), 15)
+    starts += start("Target", lane_position(-2, 30), 10, f"<PrivateAction>{ahead}</PrivateAction>")
+    actor = read_openscenario(write(tmp_path, document(starts))).scenario.actors[0]
+    assert actor.pose.x == pytest.approx(20.0 + 2.0 * 10.0 + 1.4)
+    (phase,) = actor.phases
+    assert phase.gap == Gap(time=2.0, side="ahead")
+    starts = start("Ego", lane_position(-1, 20), 15) + start("Target", lane_position(-2, 100), 10)
+    late = read_openscenario(write(tmp_path, document(starts, event("late", keep(distance="9"), by_time(2)))))
+    assert late.scenario.actors[0].phases[0].gap == Gap(9.0, free_space=True, side="any")
+    assert late.doubts == ("LongitudinalDistanceAction in event 'late': 'Target' drives there, it does not jump",)
 
 
 WEATHER = '<GlobalAction><EnvironmentAction><Environment name="rain"/></EnvironmentAction></GlobalAction>'

@@ -20,6 +20,7 @@ from ssad.core.types import (
     Episode,
     EpisodeAgent,
     EpisodeLimits,
+    Gap,
     LateralPhase,
     Phase,
     PhaseTrigger,
@@ -121,6 +122,82 @@ def test_jerk_stays_within_its_limit(speeds: dict[str, np.ndarray], name: str) -
         rates = np.interp(fine, [0.0, 1.5, 1.6, 4.6, held, held + 1.5], [0.0, 3.0, 3.0, -3.0, -3.0, 0.0])
         course = 10.0 + np.append(0.0, np.cumsum(0.5 * (rates[1:] + rates[:-1]))) * 1e-3
         np.testing.assert_allclose(speed, course[::100][: len(speed)], atol=2e-3)
+
+
+# ---------------------------------------------------------------- distances
+
+SLOWER = Phase(8.0, PhaseTrigger("time", 12.0), acceleration=2.0)
+FASTER = Phase(14.0, PhaseTrigger("time", 20.0), acceleration=2.0)
+WITHIN = {"max_acceleration": 2.0, "max_deceleration": 3.0}
+# place at the start, speed there, gap, whether it is continuous; the leader starts at 150 m with 15 m/s
+GAPS = {
+    "far": (20.0, 20.0, Gap(20.0, **WITHIN), True),
+    "near": (140.0, 15.0, Gap(40.0, max_speed=16.0, **WITHIN), True),
+    "free": (110.0, 15.0, Gap(20.0, free_space=True), True),
+    "headway": (115.0, 15.0, Gap(2.0, time=1.5, **WITHIN), True),
+    "ahead": (160.0, 15.0, Gap(20.0, side="any"), True),
+    "once": (110.0, 15.0, Gap(20.0), False),
+}
+
+
+@pytest.fixture(scope="module")
+def gaps() -> dict[str, np.ndarray]:
+    """Distance to the leader, speed and speed of the leader [T, 3] of all cases, 0.1 s apart."""
+    agents = []
+    for number, (name, (place, speed, gap, continuous)) in enumerate(GAPS.items()):
+        y = 10.0 * (number + 2)
+        changes = (SLOWER, FASTER) if name not in ("far", "near") else ()
+        agents.append(scripted(f"leader {name}", 150.0, y, speed=15.0, phases=changes))
+        kept = Phase(gap=replace(gap, reference=f"leader {name}"), continuous=continuous, name="gap")
+        stop = Phase(2.0, PhaseTrigger("phase_end", phase="gap", delay=3.0))
+        phases = (kept,) if continuous else (kept, stop)
+        agents.append(scripted(name, place, y, speed=speed, phases=phases))
+    result = drive([episode(ego(), *agents, limits=ON)], 300)
+    place, speed = result["pose"][:, 0, 1:, 0].astype(np.float64), result["speed"][:, 0, 1:].astype(np.float64)
+    return {
+        name: np.stack([place[:, row] - place[:, row + 1], speed[:, row + 1], speed[:, row]], 1)
+        for row, name in zip(range(0, len(agents), 2), GAPS, strict=True)
+    }
+
+
+@pytest.mark.parametrize(("name", "target", "max_speed"), [("far", 20.0, 40.0), ("near", 40.0, 16.0)])
+def test_a_gap_is_reached_without_overshoot(
+    gaps: dict[str, np.ndarray], name: str, target: float, max_speed: float
+) -> None:
+    """Full acceleration, full deceleration from r^2 = 2 a (e - a T^2 / 2) on, and e falls to 9/11 in a step at last."""
+    gap, speed, leader = gaps[name].T
+    rates = np.diff(speed) / DT
+    assert rates.min() >= -3.0 - 1e-3
+    assert rates.max() <= 2.0 + 1e-3
+    assert speed.max() <= max_speed + 1e-3
+    error, closing = gap - target, speed - leader
+    assert np.sign(error[0]) * error.min(initial=0.0, where=np.sign(error) != np.sign(error[0])) >= -2e-3
+    assert np.sign(error[0]) * error[-1] == pytest.approx(0.0, abs=2e-3)
+    if name == "far":
+        braking = np.flatnonzero(rates < -2.9)
+        np.testing.assert_allclose(closing[braking] ** 2, 6.0 * (error[braking] - 0.375), rtol=0.02)
+        tail = np.flatnonzero(np.abs(error) < 0.5)[:8]
+        np.testing.assert_allclose(error[tail[1:]] / error[tail[:-1]], 0.45 / 0.55, rtol=0.02)
+
+
+def test_a_gap_is_held_behind_a_leader_that_changes_its_speed(gaps: dict[str, np.ndarray]) -> None:
+    for name, target in (("free", 20.0 + 4.9), ("ahead", -20.0)):
+        assert gaps[name][110:, 0] == pytest.approx(target, abs=0.05), name
+        assert np.ptp(gaps[name][110:, 2]) == pytest.approx(7.0, abs=0.01)
+    gap, speed, _ = gaps["headway"].T
+    # its errors fall to 37 % in the headway and 0.5 s, which is 7 s after the leader's last change
+    for step, leader in ((119, 15.0), (300, 14.0)):
+        assert gap[step] == pytest.approx(2.0 + 1.5 * leader, abs=0.2), step
+        assert speed[step] == pytest.approx(leader, abs=0.1)
+
+
+def test_a_gap_that_is_not_continuous_ends(gaps: dict[str, np.ndarray]) -> None:
+    """Once it is reached the actor keeps its speed, and phases that wait for the end begin."""
+    gap, speed, _ = gaps["once"].T
+    reached = int(np.flatnonzero(np.abs(gap - 20.0) < 0.02)[0])
+    np.testing.assert_allclose(speed[reached + 2 : reached + 28], 15.0, atol=0.01)
+    assert int(np.flatnonzero(speed < 14.0)[0]) == pytest.approx(reached + 32, abs=3)
+    assert speed[-1] == pytest.approx(2.0)
 
 
 def test_only_full_braking_depends_on_the_brakes_and_the_road() -> None:

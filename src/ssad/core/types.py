@@ -269,6 +269,35 @@ class Arrival:
 
 
 @dataclass(frozen=True)
+class Gap:
+    """Distance along the road that an actor keeps to another agent: `distance` plus `time` times a speed.
+
+    The speed is that of whoever is behind, which makes `time` a time headway. The limits are those of the actor's
+    motion; None: those of its model on the surface.
+
+    Attributes:
+        distance: m.
+        time: s.
+        reference: Name of the other agent.
+        free_space: Measure between the bodies instead of their centres.
+        side: Whether the actor stays `behind` the other agent or `ahead` of it; `any`: where it is when the phase
+            begins.
+        max_acceleration: m/s^2.
+        max_deceleration: Magnitude, m/s^2.
+        max_speed: m/s.
+    """
+
+    distance: float = 0.0
+    time: float = 0.0
+    reference: str = "ego"
+    free_space: bool = False
+    side: Literal["behind", "ahead", "any"] = "behind"
+    max_acceleration: float | None = None
+    max_deceleration: float | None = None
+    max_speed: float | None = None
+
+
+@dataclass(frozen=True)
 class Phase:
     """One piece of a scripted behaviour: once `when` holds (latched, in order), drive at `speed` m/s.
 
@@ -277,7 +306,7 @@ class Phase:
 
     Attributes:
         speed: Target speed, m/s. With `reference`: difference to its speed (or, with `factor`, multiple of it). With
-            `arrival`: speed at the point; None: any.
+            `arrival`: speed at the point; None: any. With `gap`: None.
         when: Condition that starts the phase.
         name: Name by which triggers refer to the phase.
         acceleration: Magnitude of the change of speed, m/s^2; a negative sign, for braking, has no further meaning.
@@ -289,9 +318,11 @@ class Phase:
         distance: Distance over which the speed is reached, m.
         reference: Agent to whose speed `speed` refers; "": none.
         factor: Take `speed` as a multiple of the speed of `reference`, not as the difference to it.
-        continuous: Go on following the speed of `reference`, not only that at the start of the phase.
+        continuous: Go on following the speed of `reference`, not only that at the start of the phase. With `gap`: go on
+            keeping it; otherwise the phase ends once the gap is reached, and the actor keeps its speed.
         arrival: Meeting that determines the speed in place of a target speed.
         anytime: Begin as soon as `when` holds, even if phases earlier in the list have not begun.
+        gap: Distance to another agent that determines the speed in place of a target speed.
     """
 
     speed: float | None = None
@@ -307,6 +338,7 @@ class Phase:
     continuous: bool = False
     arrival: Arrival | None = None
     anytime: bool = False
+    gap: Gap | None = None
 
 
 @dataclass(frozen=True)

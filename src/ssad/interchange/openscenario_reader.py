@@ -517,7 +517,7 @@ class _Reader:
         if place is None:
             return ()
         fastest = max([entity.speed, *(phase.speed or 0.0 for phase in entity.phases)])
-        if any(phase.reference or phase.arrival for phase in entity.phases):
+        if any(phase.reference or phase.arrival or phase.gap for phase in entity.phases):
             fastest = max(fastest, self.ego.speed + 10.0)
         lane_points = lane_path(self.graph, place, self._way(fastest, limits))
         start_offset = -math.sin(pose.yaw) * (pose.x - lane_points[0, 0]) + math.cos(pose.yaw) * (

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ssad.core.import_report import ImportReport
-from ssad.core.types import Arrival, LateralPhase, Phase, PhaseTrigger, Pose
+from ssad.core.types import Arrival, Gap, LateralPhase, Phase, PhaseTrigger, Pose
 from ssad.interchange.openscenario_entities import Entity
 from ssad.interchange.openscenario_places import PositionReader
 from ssad.interchange.openscenario_trajectories import SampledTrajectory
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 LATERAL_TIME: Final = 3.0  # s of a lateral motion whose dynamics the file does not limit
 MAX_WAITING: Final = 50  # events that wait for each other, in a chain
+MAX_RATE: Final = 100.0  # m/s^2 and m/s that a limit can have; beyond, it is none
 MAX_PROFILE: Final = 12  # phases of a speed profile
 _KINDS: Final = ("Story", "Act", "ManeuverGroup", "Maneuver", "Event", "Action")
 _SHAPES: Final = ("linear", "sinusoidal", "cubic", "step")
@@ -458,6 +459,8 @@ class StoryboardReader:
             motion.phases = [speed_phase] if speed_phase else []
         elif (profile := content.find(".//SpeedProfileAction")) is not None:
             motion.phases = self._profile(entity, profile)
+        elif (keep := content.find(".//LongitudinalDistanceAction")) is not None:
+            motion.phases = self._keep_distance(entity, keep)
         elif (change := content.find(".//LaneChangeAction")) is not None:
             lateral = self._lane_change(entity, change)
             motion.lateral = [lateral] if lateral else []
@@ -511,13 +514,21 @@ class StoryboardReader:
         routing = (
             content if content.tag == "RoutingAction" else inner_action if inner_action.tag == "RoutingAction" else None
         )
+        keep = content.find(".//LongitudinalDistanceAction")
+        if keep is not None and not entity.ego and keep.find("DynamicConstraints") is None:
+            # Without limits the distance is there at once.
+            other = self.triggers.referenced_entity(keep)
+            if trigger == ALWAYS and entity.placed and other.placed:
+                self._place_at_distance(entity, other, keep)
+            else:
+                self.doubts[
+                    f"LongitudinalDistanceAction in {label}: '{entity.name}' drives there, it does not jump"
+                ] += 1
         if motion.phases or motion.lateral:
             entity.phases += _with_trigger(motion.phases, trigger)
             entity.lateral += _with_trigger(motion.lateral, trigger)
         elif routing is not None:
             self._routing(entity, routing, action, trigger, label)
-        elif (keep := content.find(".//LongitudinalDistanceAction")) is not None:
-            self._keep_distance(entity, keep, trigger, label)
         elif content.find(".//SpeedAction") is None and content.find(".//LaneChangeAction") is None:
             if entity.ego and inner_action.tag in _OF_DRIVER:
                 self.omissions[f"{inner_action.tag} at {label}: the system under test drives the ego"] += 1
@@ -773,25 +784,39 @@ class StoryboardReader:
 
     # ------------------------------------------------------------ distances
 
-    def _keep_distance(self, entity: Entity, action: Element, trigger: PhaseTrigger, label: str) -> None:
-        """Place an entity at its distance at the start; later, follow the speed of the other entity."""
+    def _keep_distance(self, entity: Entity, action: Element) -> list[Phase]:
+        """Return the phase of a LongitudinalDistanceAction."""
         other = self.triggers.referenced_entity(action)
-        if entity.ego:
-            self.omissions[f"LongitudinalDistanceAction at {label}: the system under test drives the ego"] += 1
-            return
-        continuous = self.values.truth(action, "continuous", default=False)
-        dynamic = action.find("DynamicConstraints") is not None
-        if trigger == ALWAYS and not dynamic and entity.placed and other.placed:
-            self._place_at_distance(entity, other, action)
-            if not continuous:
-                return
-        if not continuous and not dynamic:
-            self.doubts[f"LongitudinalDistanceAction in {label}: '{entity.name}' does not jump"] += 1
-            return
-        self.doubts[f"the distance of '{entity.name}' to '{other.name}': it follows its speed only"] += 1
-        name = self._name(StoryElement(action, (label,), None), entity)
-        reference = self.triggers.agent_name(other)
-        entity.phases.append(Phase(0.0, trigger, name=name, reference=reference, continuous=continuous, anytime=True))
+        limits = action.find("DynamicConstraints")
+        stated: dict[str, float | None] = {"max_acceleration": None, "max_deceleration": None, "max_speed": None}
+        for key, attribute_name in zip(stated, ("maxAcceleration", "maxDeceleration", "maxSpeed"), strict=True):
+            value = 0.0 if limits is None else self.values.number(limits, attribute_name, 0.0)
+            # Full power and full brakes are what a gap without limits has; some files state 1e10 for none.
+            if value in entity.limits or not 0.0 < value <= MAX_RATE:
+                continue
+            if key != "max_speed" or value < entity.max_speed:
+                stated[key] = value
+        if limits is not None and any(name.endswith("Rate") for name, _ in limits.items()):
+            self.doubts[f"the limits of the jerk of '{entity.name}' while it takes its distance are left out"] += 1
+        distance, time = self.values.number(action, "distance", 0.0), self.values.number(action, "timeGap", 0.0)
+        is_free = self.values.truth(action, "freespace", default=False)
+        displacement = self.values.text(action, "displacement", "any")
+        side = {"leadingReferencedEntity": "ahead", "trailingReferencedEntity": "behind"}.get(displacement, "any")
+        if not is_free and side != "any":
+            # Distances are those of reference points; a gap is that of centres.
+            back = other.centre[0] - entity.centre[0]
+            distance = max(distance + (back if side == "behind" else -back), 0.0)
+        if distance <= 0.0 and time <= 0.0:
+            distance = 0.01  # a distance of 0 between reference points
+        gap = Gap(
+            max(distance, 0.0),
+            max(time, 0.0),
+            self.triggers.agent_name(other),
+            free_space=is_free,
+            side=side,  # type: ignore[arg-type]
+            **stated,
+        )
+        return [Phase(gap=gap, continuous=self.values.truth(action, "continuous", default=False))]
 
     def _place_at_distance(self, entity: Entity, other: Entity, action: Element) -> None:
         """Place an entity along the lane of another, at a distance to it."""

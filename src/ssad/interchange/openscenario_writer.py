@@ -25,6 +25,7 @@ from ssad.core.types import (
     Episode,
     EpisodeAgent,
     EpisodeLimits,
+    Gap,
     LateralPhase,
     Model,
     Phase,
@@ -341,6 +342,9 @@ class _Writer:
             return
         limits = agent_model(agent)
         longitudinal = _node(action, "LongitudinalAction")
+        if phase.gap is not None:
+            self._write_gap(longitudinal, phase, phase.gap, limits)
+            return
         if phase.jerk is not None:
             acceleration = abs(phase.acceleration or limits.max_accel)
             profile = _node(longitudinal, "SpeedProfileAction", followingMode="follow")
@@ -375,6 +379,25 @@ class _Writer:
             speedTargetValueType="factor" if phase.factor else "delta",
             continuous=phase.continuous,
         )
+
+    def _write_gap(self, parent: Element, phase: Phase, gap: Gap, limits: Model) -> None:
+        displacement = {"behind": "trailingReferencedEntity", "ahead": "leadingReferencedEntity"}
+        action = _node(
+            parent,
+            "LongitudinalDistanceAction",
+            entityRef=self._agent(gap.reference),
+            continuous=phase.continuous,
+            freespace=gap.free_space,
+            coordinateSystem="road",
+            displacement=displacement.get(gap.side, "any"),
+            **{"timeGap": float(gap.time)} if gap.time else {"distance": float(gap.distance)},
+        )
+        if gap.time and gap.distance:
+            self.omissions.append("the distance of a gap that also has a time: the format has one of them")
+        stated = (gap.max_acceleration or limits.max_accel, gap.max_deceleration or limits.max_brake)
+        names = ("maxAcceleration", "maxDeceleration", "maxSpeed")
+        values = (*stated, gap.max_speed or limits.max_speed)
+        _node(action, "DynamicConstraints", **dict(zip(names, map(float, values), strict=True)))
 
     def _write_arrival(self, action: Element, phase: Phase) -> None:
         arrival = phase.arrival

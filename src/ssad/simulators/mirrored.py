@@ -51,7 +51,7 @@ class MirroredSimulator:
 
 # Keys of a phase that state the course of a speed. A foreign simulator moves its vehicles by its own dynamics, so that
 # pedals alone cannot keep to them.
-_COURSE = ("acceleration", "jerk", "shape", "duration", "distance", "arrival")
+_COURSE = ("acceleration", "jerk", "shape", "duration", "distance", "arrival", "gap")
 
 
 def check_phases(episodes: Sequence[Episode], simulator: str) -> None:

@@ -11,7 +11,18 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.triggers import EGO, PAIRS, PHASE_KINDS, all_phases, default_rule, reference_of, trigger_groups
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, LateralPhase, Phase, PhaseTrigger, Pose, Route
+from ssad.core.types import (
+    AgentKind,
+    Controller,
+    Episode,
+    EpisodeAgent,
+    Gap,
+    LateralPhase,
+    Phase,
+    PhaseTrigger,
+    Pose,
+    Route,
+)
 from ssad.world.kernels.data import Edge, PhaseCondition, ScriptMotion, Scripts, SpeedProfile, SpeedShape, array_types
 from ssad.world.models import MODELS
 
@@ -20,6 +31,7 @@ LATERAL_TIME = 3.0  # s of a lateral phase that says nothing else
 MAX_OFF_PATH = 5.0  # m that a meeting point may be off the path of its agent
 WORD = 32  # bits of a word of a condition's history
 _MEASURES = ("straight", "road", "lateral")
+_SIDES = {"behind": 1.0, "ahead": -1.0, "any": 0.0}
 
 
 def script_motion(agent: EpisodeAgent) -> ScriptMotion:
@@ -143,12 +155,17 @@ class ScriptTables:
         profile = SpeedProfile.LIMITED
         timing = 0.0
         reference = lookup.agent(phase.reference) if phase.reference else -1
-        own_meeting = other_meeting = (0.0, 0.0, 0.0)
+        own_meeting: tuple[float, ...] = (0.0, 0.0, 0.0)
+        other_meeting: tuple[float, ...] = (0.0, 0.0, 0.0)
         if phase.arrival is not None:
             profile = SpeedProfile.ARRIVAL
             reference = lookup.agent(phase.arrival.reference)
             own_meeting = meeting_point(agent, phase.arrival.point)
             other_meeting = meeting_point(episode.agents[reference], phase.arrival.reference_point)
+        elif phase.gap is not None:
+            profile = SpeedProfile.GAP
+            reference = lookup.agent(phase.gap.reference)
+            own_meeting, other_meeting = _gap_rows(phase.gap)
         elif phase.shape == "step":
             profile = SpeedProfile.STEP
         elif phase.duration is not None:
@@ -163,8 +180,8 @@ class ScriptTables:
         flags = int(phase.factor) + 2 * int(phase.continuous) + 4 * int(phase.speed is not None)
         self._rows["course"].append((profile, SpeedShape[phase.shape.upper()], reference, flags))
         self._rows["anytime"].append(int(phase.anytime))
-        self._rows["meeting"].append((*own_meeting, 0.0))
-        self._rows["other_meeting"].append((*other_meeting, 0.0))
+        self._rows["meeting"].append((*own_meeting, 0.0)[:4])
+        self._rows["other_meeting"].append((*other_meeting, 0.0)[:4])
 
     def _lateral_row(self, phase: LateralPhase, agent: EpisodeAgent, number: int) -> None:
         profile, timing = SpeedProfile.DURATION, LATERAL_TIME
@@ -195,6 +212,15 @@ class ScriptTables:
                 values = np.zeros((1, *values.shape[1:]))
             setattr(scripts, name, wp.array(values, dtype=array_type.dtype, device=device))
         return scripts
+
+
+def _gap_rows(gap: Gap) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the rows of `Scripts.meeting` and `Scripts.other_meeting` of a gap."""
+    limits = (gap.max_acceleration, gap.max_deceleration, gap.max_speed)
+    return (
+        (gap.distance, gap.time, _SIDES[gap.side], float(gap.free_space)),
+        (*(limit or 0.0 for limit in limits), 0.0),
+    )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, RouteError
-from ssad.core.types import Arrival, Controller, LateralPhase, Phase, PhaseTrigger
+from ssad.core.types import Arrival, Controller, Gap, LateralPhase, Phase, PhaseTrigger
 from ssad.scenarios.dynamic import build_episode, read_scenarios, save_scenarios, scenario_from
 from ssad.world.roads import load_town
 from ssad.world.world import World
@@ -45,6 +45,7 @@ actors:
   speed: 2.0
   phases:
   - {speed: 3.0, arrival: {point: [260.0, -7.0], reference_point: [257.0, -5.25]}}
+  - {gap: {time: 1.5, reference: cutter, max_speed: 5.0}, continuous: true}
 """
 
 
@@ -60,7 +61,10 @@ def test_a_file_with_all_kinds_of_phases(tmp_path: Path) -> None:
     assert cutter.lateral[1] == LateralPhase(
         1, 0.5, PhaseTrigger(any=(PhaseTrigger("phase_end", phase="slow", delay=1.0), both)), rate=1.0
     )
-    assert meeting.phases == (Phase(3.0, arrival=Arrival((260.0, -7.0), (257.0, -5.25))),)
+    assert meeting.phases == (
+        Phase(3.0, arrival=Arrival((260.0, -7.0), (257.0, -5.25))),
+        Phase(gap=Gap(time=1.5, reference="cutter", max_speed=5.0), continuous=True),
+    )
     save_scenarios(tmp_path / "again.yaml", scenario)
     assert read_scenarios(tmp_path / "again.yaml") == (scenario,)
     town = load_town("ProvingGround")
@@ -85,6 +89,10 @@ def data(**changes: Any) -> dict[str, Any]:
 
 def phase(**changes: Any) -> dict[str, Any]:
     return data(phases=[{"speed": 5.0, **changes}])
+
+
+def kept(**changes: Any) -> dict[str, Any]:
+    return data(phases=[{"gap": {"distance": 5.0}, **changes}])
 
 
 def swerve(**changes: Any) -> dict[str, Any]:
@@ -119,6 +127,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (phase(arrival={**MEETING, "point": [1e6, 0.0]}), "arrival.point: beyond 100000 m"),
     (phase(arrival={**MEETING, "reference": "c"}), "arrival.reference: there is no actor 'c'"),
     (phase(arrival={"point": [1.0, 2.0]}), "arrival: key 'reference_point' is missing"),
+    (phase(gap={"distance": 5.0}), "phases[0].speed: a gap determines the speed; leave it out"),
+    (kept(duration=2.0), "phases[0].duration: a gap determines the speed"),
+    (data(phases=[{"gap": {"reference": "b"}}]), "phases[0].gap: needs a distance, a time or both"),
+    (data(phases=[{"gap": {"distance": -1.0}}]), "phases[0].gap.distance: -1 is outside 0 to 10000"),
+    (data(phases=[{"gap": {"time": 1.0, "max_deceleration": 0.0}}]), "phases[0].gap.max_deceleration: 0 is outside"),
+    (data(phases=[{"gap": {"time": 1.0, "max_speed": 60.0}}]), "phases[0].gap.max_speed: 60 is outside 0 to 50"),
+    (data(phases=[{"gap": {"time": 1.0, "reference": "c"}}]), "phases[0].gap.reference: there is no actor 'c'"),
+    (data(phases=[{"gap": {"time": 1.0, "side": "left"}}]), 'phases[0].gap.side: "left" is not one of'),
+    (data(phases=[{"gap": {"gap": 1.0}}]), "phases[0].gap.gap: unknown key; known: distance, time, reference"),
     (phase(accel=1.0), "phases[0].accel: unknown key; known: speed, when, name, acceleration"),
     (swerve(rate=-0.5), "lateral[0].rate: -0.5 is outside"),
     (swerve(rate=1.0, duration=2.0), "lateral[0].duration: rate fixes the pace already"),
@@ -183,6 +200,7 @@ def test_mistakes_are_named_in_one_line(scenario: dict[str, Any], message: str) 
     "scenario",
     [
         phase(reference="b", speed=-3.0, continuous=True),
+        kept(continuous=True),
         phase(name="p", when={"any": [{"kind": "phase_start", "phase": "p"}, {"kind": "time", "value": 1.0}]}),
         when(kind="ego_distance", value=0.0),
         when(kind="acceleration", value=-4.0, rule="below", agent="b"),

@@ -17,7 +17,7 @@ from ssad.core.triggers import (
     default_rule,
     trigger_groups,
 )
-from ssad.core.types import Actor, LateralPhase, Phase, PhaseTrigger
+from ssad.core.types import Actor, Gap, LateralPhase, Phase, PhaseTrigger
 
 MAX_ACCELERATION: Final = 100.0  # m/s^2
 MAX_DELAY: Final = 600.0  # s
@@ -25,6 +25,10 @@ MAX_LANES: Final = 10
 MAX_OFFSET: Final = 100.0  # m
 MAX_TIME: Final = 1.0e4  # s, and m of a distance
 _LISTS: Final = ("phases", "lateral")
+# Keys of a phase that a gap takes the place of.
+_WITHOUT_GAP: Final = (
+    *("speed", "acceleration", "jerk", "shape", "duration", "distance", "reference", "factor", "arrival"),
+)
 # Quantities that are never negative: below 0 they cannot be, and below 0 they cannot fall.
 _NEVER_NEGATIVE: Final = ("ego_distance", "travelled", "speed", *AT_POSITION)
 
@@ -83,6 +87,9 @@ def _actor_problems(actors: Sequence[Actor], index: int, max_speed: float) -> It
 def _speed_problems(
     phase: Phase, place: Place, actors: Sequence[Actor], actor: Actor, max_speed: float
 ) -> Iterator[Problem]:
+    if phase.gap is not None:
+        yield from _gap_problems(phase, place, actors, actor, max_speed)
+        return
     if phase.speed is None:
         if phase.arrival is None:
             yield place, "key 'speed' is missing"
@@ -121,6 +128,24 @@ def _speed_problems(
         yield from _agent_problem(phase.arrival.reference, (*place, "arrival", "reference"), actors, actor.name)
         for key in ("point", "reference_point"):
             yield from _point_problem(getattr(phase.arrival, key), (*place, "arrival", key))
+
+
+def _gap_problems(
+    phase: Phase, place: Place, actors: Sequence[Actor], actor: Actor, max_speed: float
+) -> Iterator[Problem]:
+    gap = phase.gap or Gap()
+    for key in _WITHOUT_GAP:
+        if getattr(phase, key) != getattr(Phase, key):
+            yield (*place, key), "a gap determines the speed; leave it out (limits stand in the gap)"
+    for key in ("distance", "time"):
+        if not 0.0 <= getattr(gap, key) <= MAX_TIME:
+            yield (*place, "gap", key), f"{getattr(gap, key):g} is outside 0 to {MAX_TIME:g}"
+    if gap.distance == gap.time == 0.0:
+        yield (*place, "gap"), "needs a distance, a time or both"
+    yield from _positive(gap.max_acceleration, (*place, "gap", "max_acceleration"), MAX_ACCELERATION)
+    yield from _positive(gap.max_deceleration, (*place, "gap", "max_deceleration"), MAX_ACCELERATION)
+    yield from _positive(gap.max_speed, (*place, "gap", "max_speed"), max_speed)
+    yield from _agent_problem(gap.reference, (*place, "gap", "reference"), actors, actor.name)
 
 
 def _lateral_problems(phase: LateralPhase, place: Place) -> Iterator[Problem]:

@@ -76,7 +76,7 @@ class SpeedProfile(IntEnum):
     """Quantity that fixes the pace of a phase.
 
     LIMITED follows the target with limited acceleration and jerk; the others are given by a time, a distance, the
-    greatest rate, nothing at all, or a meeting.
+    greatest rate, nothing at all, a meeting, or a distance to another agent.
     """
 
     LIMITED = 0
@@ -85,6 +85,7 @@ class SpeedProfile(IntEnum):
     RATE = 3
     STEP = 4
     ARRIVAL = 5
+    GAP = 6
 
 
 class ScriptMotion(IntEnum):
@@ -223,8 +224,11 @@ class Scripts:
     # [P] SpeedProfile, SpeedShape, agent (-1: none), 1 factor + 2 continuous + 4 there is a speed; of lateral phases
     # SpeedProfile, SpeedShape, first row and number of rows of `target`
     course: wp.array(dtype=wp.vec4i)
-    meeting: wp.array(dtype=wp.vec4)  # [P] point x, y, m along the agent's route (-1: it has none)
-    other_meeting: wp.array(dtype=wp.vec4)  # [P] likewise for the other agent
+    # [P] point x, y, m along the agent's route (-1: it has none); of gaps m, s, 1 behind or -1 ahead of the other agent
+    # (0: as it is), 1 between the bodies
+    meeting: wp.array(dtype=wp.vec4)
+    # [P] likewise for the other agent; of gaps acceleration, deceleration m/s^2, speed m/s (0: the model's)
+    other_meeting: wp.array(dtype=wp.vec4)
     group: wp.array(dtype=wp.vec2i)  # [G] first condition, number of conditions: all of them must hold
     condition: wp.array(dtype=wp.vec4i)  # [C] PhaseCondition, agent, other agent (-1: the position), phase (-1: none)
     form: wp.array(dtype=wp.vec4i)  # [C] 1 above (0 below), Edge, 1 between the bodies, Measure
@@ -241,7 +245,8 @@ class ScriptState:
     ended: wp.array2d(dtype=wp.int32)  # [B, P] stamp of its end
     history: wp.array2d(dtype=wp.int32)  # [B, H] values of conditions in the last steps, a bit each
     running: wp.array2d(dtype=wp.vec2i)  # [B, A] 1 + the number of the running phase and lateral phase; 0: none
-    course: wp.array2d(dtype=wp.vec4)  # [B, A] speed at the start of the phase m/s, target m/s, duration s, accel m/s^2
+    # [B, A] speed at the start of the phase m/s, target m/s, duration s (of gaps: 1 behind, -1 ahead), accel m/s^2
+    course: wp.array2d(dtype=wp.vec4)
     # [B, A] of the lateral phase: m left of the route at its start, place there m along the route, duration s or
     # length m, 1 if it is a length
     swerve: wp.array2d(dtype=wp.vec4)

@@ -34,6 +34,9 @@ ON_TIME = wp.constant(1.0e-4)  # s by which rounding may delay a time
 SIDESTEP = wp.constant(0.7)  # greatest share of its speed that a vehicle moves sideways
 ROUNDING = wp.constant(1.0e-4)  # m/s
 SEARCH = wp.constant(8)  # corrections of a place along a route
+GAP_TIME = wp.constant(0.5)  # s in which the error of a gap falls to 37 %
+GAP_REACHED = wp.constant(0.02)  # m
+GAP_CLOSING = wp.constant(0.05)  # m/s
 PI = wp.constant(3.141592653589793)
 
 
@@ -487,7 +490,7 @@ def begin_phase(
     acceleration = script.course[scene_index, agent_index][3]
     target = speed
     duration = float(0.0)
-    if course[0] != SpeedProfile.ARRIVAL:
+    if course[0] != SpeedProfile.ARRIVAL and course[0] != SpeedProfile.GAP:
         target = target_of(state, scene_index, motion, course)
     if course[0] == SpeedProfile.STEP:
         state.speed[scene_index, agent_index] = target
@@ -702,6 +705,83 @@ def meeting_speed(
 
 
 @wp.func
+def gap_speed(
+    bank: EpisodeArrays,
+    roads: Roads,
+    scripts: Scripts,
+    state: State,
+    scene_index: int,
+    agent_index: int,
+    phase: int,
+    model_limits: wp.vec2,
+    model_speed: float,
+    side_before: float,
+    dt: float,
+) -> wp.vec4:
+    """Return the speed after dt that keeps a distance, 1 if it has it by then, 1 behind or -1 ahead, the other's speed.
+
+    The error e of the distance falls at the speed e / GAP_TIME where it is small, else at the speed from which the
+    actor comes to the speed of the other one within its limit a: 2 a (e - a GAP_TIME^2 / 2) = r^2. Both hold at the end
+    of the step, which makes the approach free of overshoot.
+    """
+    episode = state.episode[scene_index]
+    gap = scripts.meeting[phase]
+    constraint = scripts.other_meeting[phase]
+    other_index = scripts.course[phase][2]
+    pose = state.pose[scene_index, agent_index]
+    other_pose = state.pose[scene_index, other_index]
+    place = ahead_and_left(bank, roads, state, scene_index, agent_index, other_index, other_pose[0], other_pose[1])
+    ahead = place[0]
+    side = gap[2]
+    if side == 0.0:
+        side = side_before
+    if side == 0.0:
+        side = 1.0
+        if ahead < 0.0:
+            side = -1.0
+    distance = gap[0]
+    if gap[3] == 1.0:
+        body = bank.body[bank.model[episode, agent_index]]
+        other_body = bank.body[bank.model[episode, other_index]]
+        distance = distance + body[0] + half_extent(other_pose[2] - pose[2], other_body, False)
+    limits = model_limits
+    if constraint[0] > 0.0:
+        limits = wp.vec2(constraint[0], limits[1])
+    if constraint[1] > 0.0:
+        limits = wp.vec2(limits[0], constraint[1])
+    max_speed = model_speed
+    if constraint[2] > 0.0:
+        max_speed = wp.min(max_speed, constraint[2])
+    current = state.speed[scene_index, agent_index]
+    other_before = state.speed[scene_index, other_index]
+    other_speed = other_before + state.accel[scene_index, other_index] * dt
+    if other_before >= 0.0:
+        other_speed = wp.max(other_speed, 0.0)
+    lag = 0.5 * dt
+    if side > 0.0:
+        lag = lag + gap[1]
+    # the error at the end of the step is `error` less `lag` times the closing speed then
+    error = ahead - 0.5 * (current - other_before) * dt - side * (distance + gap[1] * other_speed)
+    sign = float(1.0)
+    limit = limits[1]
+    if error < 0.0:
+        sign = -1.0
+        limit = limits[0]
+    closing = wp.abs(error) / (GAP_TIME + lag)
+    if closing > limit * GAP_TIME:
+        slowing = limit * lag
+        remaining = wp.abs(error) - 0.5 * limit * GAP_TIME * GAP_TIME
+        closing = wp.sqrt(slowing * slowing + 2.0 * limit * remaining) - slowing
+    target = wp.clamp(other_speed + sign * closing, 0.0, max_speed)
+    speed = current + wp.clamp(target - current, -limits[1] * dt, limits[0] * dt)
+    difference = speed - other_speed
+    reached = float(0.0)
+    if wp.abs(error - lag * difference) < GAP_REACHED and wp.abs(difference) < GAP_CLOSING:
+        reached = 1.0
+    return wp.vec4(speed, reached, side, other_speed)
+
+
+@wp.func
 def next_speed(
     bank: EpisodeArrays,
     roads: Roads,
@@ -776,6 +856,17 @@ def next_speed(
         if (course[3] & 4) == 4:
             held = motion[0]
         script.course[scene_index, agent_index] = wp.vec4(profile[0], held, 0.0, acceleration)
+    elif course[0] == SpeedProfile.GAP:
+        kept = gap_speed(
+            bank, roads, scripts, state, scene_index, agent_index, base + phase, limits, power[2], profile[2], dt
+        )
+        speed = kept[0]
+        acceleration = (speed - current) / dt
+        held = speed
+        if (course[3] & 2) == 0 and kept[1] == 1.0:
+            is_done = 1
+            held = wp.max(kept[3], 0.0)
+        profile = wp.vec4(profile[0], held, kept[2], acceleration)
     else:
         elapsed = float(state.step[scene_index] + 2 - script.begun[scene_index, phase]) * dt
         if elapsed >= profile[2] - ON_TIME:
