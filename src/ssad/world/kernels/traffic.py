@@ -30,8 +30,8 @@ from ssad.world.kernels.drivers import (
     CREEPS,
     FIRM,
     RUNS_RED,
-    YIELD_LEAST,
     STOPS_AT_YELLOW,
+    YIELD_LEAST,
     driver_follows,
     driver_speed,
     driver_stops,
@@ -856,7 +856,9 @@ def react_to_agents(
                 goes_first = change_priority(perceived, b, i, j, goes_first)
                 crosses = wp.abs(wp.sin(other_pose[2] - pose[2])) > 0.5 or wp.cos(other_pose[2] - pose[2]) < -0.5
                 turn = other_pose[2] - pose[2]
-                aside = wp.abs((other_pose[1] - pose[1]) * wp.cos(pose[2]) - (other_pose[0] - pose[0]) * wp.sin(pose[2]))
+                aside = wp.abs(
+                    (other_pose[1] - pose[1]) * wp.cos(pose[2]) - (other_pose[0] - pose[0]) * wp.sin(pose[2])
+                )
                 merges = wp.cos(turn) > 0.8 and aside > 1.5 and not walks
                 if not goes_first and not walks and crosses:
                     margin_strides = MARGIN
@@ -925,7 +927,9 @@ def react_to_agents(
                     ahead = (other_pose[0] - pose[0]) * cosine + (other_pose[1] - pose[1]) * sine
                     if ahead > 0.0 or (ahead == 0.0 and not goes_first):
                         room = wp.max(ahead - own_body[0] - other_half[0], 1.0)
-                        react = wp.min(react, wp.max(follow(speed, perceived.speed[b, j], room, style), -FIRM - style[2]))
+                        react = wp.min(
+                            react, wp.max(follow(speed, perceived.speed[b, j], room, style), -FIRM - style[2])
+                        )
                 elif not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS and not waits):
                     if at_line and style[0] > 0.0:
                         react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
