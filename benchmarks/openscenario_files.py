@@ -30,11 +30,8 @@ from ssad.interchange.openscenario_reader import read_openscenario_set
 MOST = 20  # scenarios read of a distribution
 SHOWN = 25  # reasons
 PAGE = "results/openscenario-imports.md"
-# What has no part in the motion of actors.
-APPEARANCE = re.compile(
-    r"EnvironmentAction|LightStateAction|SetAction|VariableCondition|VisibilityAction|ControllerAction|controller"
-    r"|of the ego|UserDefinedAction|of the stop trigger|ParameterCondition|no entity is called|AppearanceAction"
-)
+# Doubts that leave the motion of actors as it is.
+STANDING = re.compile(r"of the stop trigger|no entity is called|can never fire|^map: ")
 
 
 @dataclass
@@ -46,7 +43,8 @@ class Result:
         error: Why it does not import.
         seconds: CPU time, s.
         actors: Number of actors of its first scenario.
-        omissions: What is not carried over.
+        omissions: What is not carried over and leaves motions as they are.
+        doubts: What differs from the file.
     """
 
     path: Path
@@ -54,11 +52,12 @@ class Result:
     seconds: float = 0.0
     actors: int = 0
     omissions: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def is_whole(self) -> bool:
         """Whether all that moves actors is carried over."""
-        return not self.error and all(APPEARANCE.search(reason) for reason in self.omissions)
+        return not self.error and all(STANDING.search(reason) for reason in self.doubts)
 
 
 def is_scenario(path: Path) -> bool:
@@ -82,6 +81,7 @@ def check_file(path: Path) -> Result:
     result.seconds = time.process_time() - started
     result.actors = len(imported.scenarios[0].actors)
     result.omissions = list(imported.report.omissions)
+    result.doubts = list(imported.report.doubts)
     return result
 
 
@@ -109,7 +109,7 @@ def report_lines(folders: dict[str, list[Result]]) -> dict[str, list[str]]:
         rows.append(f"| {' | '.join(cells)} |")
         errors += [f"* {repository}: {result.error}" for result in results if result.error]
         for result in good:
-            reasons.update({_general(reason) for reason in result.omissions})
+            reasons.update({_general(reason) for reason in result.omissions + result.doubts})
     lines = ["| Reason | files |", "|---|---:|"]
     lines += [f"| {reason} | {count} |" for reason, count in reasons.most_common(SHOWN)]
     return {"files": rows, "errors": errors or ["None."], "reasons": lines}

@@ -130,6 +130,16 @@ def test_xml_broken_names_the_line() -> None:
     assert safeio.parse_xml("<a><b/></a>").tag == "a"
 
 
+@pytest.mark.parametrize(("depth", "is_refused"), [(200, False), (201, True), (100_000, True)])
+def test_xml_nested_too_deeply_is_refused(depth: int, is_refused: bool) -> None:
+    text = "<a>" * depth + "</a>" * depth
+    if is_refused:
+        with pytest.raises(FormatError, match=r"f\.xml: <a> is nested deeper than 200 levels"):
+            safeio.parse_xml(text, "f.xml")
+    else:
+        assert safeio.parse_xml(text, "f.xml").tag == "a"
+
+
 def test_npz_round_trip_has_fixed_bytes(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros((0, 4), np.int32), "c": np.array(True)}
     safeio.save_npz(tmp_path / "x.npz", arrays)

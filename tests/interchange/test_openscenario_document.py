@@ -57,6 +57,19 @@ def test_what_has_no_value_is_refused_with_its_line(declarations: str, part: str
         attributes(tmp_path, declared("a", "1"), "<Part/>", z="1")
 
 
+def test_long_chains_of_parameters_are_refused(tmp_path: Path) -> None:
+    chain = "".join(declared(f"a{number}", f"$a{number + 1}") for number in range(49)) + declared("a49", "7")
+    assert attributes(tmp_path, chain, '<Part x="$a0"/>')["x"] == "7"
+    chain = "".join(declared(f"a{number}", f"$a{number + 1}") for number in range(1000)) + declared("a1000", "7")
+    with pytest.raises(FormatError, match=r"a\.xosc:\d+: ParameterDeclaration: parameter 'a50' ends a chain"):
+        attributes(tmp_path, chain, '<Part x="$a0"/>')
+
+
+def test_deep_nesting_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"a\.xosc:6: <b> is nested deeper than 200 levels"):
+        attributes(tmp_path, declared("a", "1"), "<b>" * 400 + "</b>" * 400)
+
+
 def test_one_group_of_constraints_must_hold(tmp_path: Path) -> None:
     """Groups are alternatives; the constraints of a group hold together, and may be expressions."""
     groups = (

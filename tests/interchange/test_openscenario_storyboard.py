@@ -11,6 +11,7 @@ import pytest
 from helpers.command import ssad
 from helpers.openscenario import by_entity, by_time, document, event, lane_position, speed_action, start, write
 
+from ssad.core.errors import FormatError
 from ssad.core.types import Controller, EpisodeTrace, LateralPhase, Phase, PhaseTrigger, Scenario
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario, read_openscenario_set
@@ -87,7 +88,7 @@ def test_a_cut_in_of_r157_drives_as_written(tmp_path: Path) -> None:
     events = event("cut in", lane_change(0, "sinusoidal", "rate", rate), near)
     events += event("brake", speed_action(5, "linear", "rate", braking), state("cut in", "event", "completeState"))
     imported = read_openscenario(write(tmp_path, document(starts, events, stop=by_time(16))))
-    assert imported.omissions == ()
+    assert imported.omissions == imported.doubts == ()
     limits = replace(imported.scenario.limits, contact="count")
     trace = drive(replace(imported.scenario, limits=limits), ego)
     time = np.arange(len(trace.x)) * STEP
@@ -250,15 +251,48 @@ def test_a_trigger_that_never_fires_is_named_with_its_line(condition: str, reaso
     assert not (tmp_path / "out.yaml").exists()
 
 
-def test_what_is_not_carried_over_is_listed_and_strict_refuses_it(tmp_path: Path) -> None:
-    starts = start("Ego", lane_position(-1, 20), 15) + start("Target", lane_position(-2, 100), 10)
-    flash = "<AppearanceAction><LightStateAction/></AppearanceAction>"
-    path = write(tmp_path, document(starts, event("flash", flash, by_time(1))))
+def test_long_chains_of_waiting_events_are_refused(tmp_path: Path) -> None:
+    show = '<VisibilityAction graphics="true" traffic="true" sensors="true"/>'
+    events = [event("brake", speed_action(3, "linear", "rate", 4), state("0", "event", "completeState"))]
+    events += [event(f"{number}", show, state(f"{number + 1}", "event", "startTransition")) for number in range(300)]
+    with pytest.raises(FormatError, match=r"test\.xosc:\d+: Storyboard\w*: '\d+' ends a chain of more than 50 events"):
+        actor_of(tmp_path, *events, event("300", show, by_time(2)))
+
+
+WEATHER = '<GlobalAction><EnvironmentAction><Environment name="rain"/></EnvironmentAction></GlobalAction>'
+FLASH = "<AppearanceAction><LightStateAction/></AppearanceAction>"
+ACTIVATE = '<ActivateControllerAction longitudinal="true"/>'
+ACTIVATE_EGO = f"<Private entityRef='Ego'><PrivateAction>{ACTIVATE}</PrivateAction></Private>"
+STANDING = by_entity("Ego", '<StandStillCondition duration="2"/>')
+TELEPORT = f"<TeleportAction>{lane_position(-1, 200)}</TeleportAction>"
+
+
+@pytest.mark.parametrize(
+    ("starts", "action", "stop", "line"),
+    [
+        (WEATHER, "", "", "not carried over: EnvironmentAction at the start"),
+        ("", FLASH, "", "not carried over: LightStateAction in event 'it'"),
+        ("", '<VisibilityAction graphics="false"/>', "", "not carried over: VisibilityAction in event 'it'"),
+        (ACTIVATE_EGO, "", "", "not carried over: ActivateControllerAction at the start of 'Ego'"),
+        ("", ACTIVATE.replace("true", "false"), "", "not carried over: ActivateControllerAction in event 'it'"),
+        ("", ACTIVATE, "", "doubtful: ActivateControllerAction in event 'it' is not carried over"),
+        ("", TELEPORT, "", "doubtful: TeleportAction in event 'it' is not carried over"),
+        ("", "", STANDING, "doubtful: StandStillCondition of the stop trigger is not carried over"),
+    ],
+)
+def test_strict_refuses_what_changes_motions(starts: str, action: str, stop: str, line: str, tmp_path: Path) -> None:
+    """Weather, lights and controllers of the ego are named; other motions and other ends are refused."""
+    starts += start("Ego", lane_position(-1, 20), 15) + start("Target", lane_position(-2, 100), 10)
+    path = write(tmp_path, document(starts, event("it", action, by_time(1)) if action else "", stop=stop))
     done = ssad("import", "openscenario", path, tmp_path / "out.yaml")
-    assert "not carried over: LightStateAction in event 'flash'" in done.stdout
-    refused = ssad("import", "openscenario", path, tmp_path / "strict.yaml", "--strict")
-    assert refused.returncode == 2
-    assert "not carried over: LightStateAction in event 'flash'; import it without --strict" in refused.stderr
+    assert [text for text in done.stdout.splitlines() if text.startswith(("not carried over", "doubtful"))] == [line]
+    strict = ssad("import", "openscenario", path, tmp_path / "strict.yaml", "--strict")
+    if line.startswith("doubtful"):
+        assert strict.returncode == 2
+        assert line.partition(": ")[2] in strict.stderr
+        assert not (tmp_path / "strict.yaml").exists()
+    else:
+        assert (tmp_path / "strict.yaml").read_bytes() == (tmp_path / "out.yaml").read_bytes()
 
 
 def test_trajectories_of_every_shape_lie_where_they_are_stated(tmp_path: Path) -> None:

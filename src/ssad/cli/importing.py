@@ -93,9 +93,7 @@ def import_openscenario(
     count: Annotated[
         int | None, typer.Option(min=1, help="Scenarios to draw from a distribution.  [default: all]")
     ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse a file with anything that is doubtful or not carried over.")
-    ] = False,
+    strict: Strict = False,
 ) -> None:
     """Turn an OpenSCENARIO XML file (1.0 to 1.3) into scenarios, and say what it does not carry over.
 
@@ -111,7 +109,6 @@ def import_openscenario(
     check_yaml(out)
     imported = read_openscenario_set(file, map_name=on, assigned=assigned_values(values or []), count=count)
     if strict:
-        imported.report.refuse_omissions(FormatError)
         imported.report.refuse_doubts(FormatError)
     scenarios = imported.scenarios
     save_scenarios(out, scenarios if len(scenarios) > 1 else scenarios[0])

@@ -22,7 +22,8 @@ class ImportReport:
         contents: Lines on what came in.
         notes: Reason -> places of what came in in another form.
         omissions: Reason -> places of what the file holds and the import does not carry over.
-        doubts: Reason -> places at which the file is likely to be wrong; `refuse_doubts` turns them into an error.
+        doubts: Reason -> places at which the file is likely to be wrong, or at which the result does something else
+            than the file states; `refuse_doubts` turns them into an error.
     """
 
     source: str
@@ -40,7 +41,7 @@ class ImportReport:
         self.omissions.setdefault(reason, []).extend([place] * count)
 
     def doubt(self, reason: str, place: str = "", *, count: int = 1) -> None:
-        """Note that the file is likely to be wrong at a place, or at `count` places."""
+        """Note that the file is likely to be wrong, or the result to differ from it, at a place or `count` places."""
         self.doubts.setdefault(reason, []).extend([place] * count)
 
     def extend(self, other: ImportReport) -> None:
@@ -81,13 +82,6 @@ class ImportReport:
         if self.doubts:
             raise error(
                 f"{self.source}: {_first(self.doubts, 'doubts')}; correct the file, or import it without --strict"
-            )
-
-    def refuse_omissions(self, error: type[SSADError]) -> None:
-        """Raise an error that names the first omission, if there is one."""
-        if self.omissions:
-            raise error(
-                f"{self.source}: not carried over: {_first(self.omissions, 'omissions')}; import it without --strict"
             )
 
 

@@ -31,6 +31,7 @@ MIB = 1 << 20
 MAX_DEPTH = 64
 MAX_ALIASED_NODES = 10_000
 MAX_JSON_DEPTH = 100
+MAX_XML_DEPTH = 200
 MAX_DIGITS = 300  # of a whole number, which must fit a float
 
 Location = Sequence[str | int]
@@ -394,7 +395,7 @@ def parse_xml(
         element_factory: Makes an element of its tag, its attributes and its line in the text; None: an `Element`.
 
     Raises:
-        FormatError: It is refused, or not valid XML, with the line.
+        FormatError: It is refused, nested deeper than 200 levels, or not valid XML, with the line.
     """
     from xml.etree.ElementTree import ParseError, TreeBuilder
 
@@ -418,6 +419,14 @@ def parse_xml(
         raise FormatError(f"{name}:{line}: not valid XML: {error}") from None
     except (ValueError, LookupError, RecursionError) as error:
         raise FormatError(f"{name}: not valid XML: {error}") from None
+    # Readers descend by recursion, which must not exhaust the stack.
+    level = [root]
+    for _ in range(MAX_XML_DEPTH):
+        level = [child for element in level for child in element]
+    if level:
+        line_number: int | None = getattr(level[0], "line", None)
+        place = name if line_number is None else f"{name}:{line_number}"
+        raise FormatError(f"{place}: <{level[0].tag[:40]}> is nested deeper than {MAX_XML_DEPTH} levels")
     return root
 
 
@@ -430,7 +439,8 @@ def read_xml(
     """Read the root element of an XML file, safely; `element_factory` as in `parse_xml`.
 
     Raises:
-        FormatError: The file cannot be read, is larger than `limit` bytes, or is not valid XML.
+        FormatError: The file cannot be read, is larger than `limit` bytes, nested deeper than 200 levels, or is not
+            valid XML.
     """
     return parse_xml(read_bytes(path, limit=limit), str(path), element_factory=element_factory)
 

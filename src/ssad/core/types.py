@@ -462,6 +462,8 @@ class TrafficPlan:
         drivers: `uniform`: all vehicles have the Autopilot's parameters. `population`: each has a driver drawn from
             published distributions.
         errors: Errors of each driver of the population an hour; see `DriverStyle`.
+        walkers: Number of walkers on the sidewalks near the route, alone and in groups; fewer where there is no room.
+        cyclists: Number of cyclists on the driving lanes near the route; fewer where there is no room.
     """
 
     intensity: float = 0.3
@@ -471,6 +473,8 @@ class TrafficPlan:
     draw: int | None = None
     drivers: Literal["uniform", "population"] = "uniform"
     errors: float = 0.0
+    walkers: int = 0
+    cyclists: int = 0
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ssad.core.safeio import MIB, read_xml
 MAX_BYTES: Final = 64 * MIB
 MAX_CATALOGUES: Final = 200  # files of a folder
 MAX_NESTED: Final = 8  # catalogue entries in catalogue entries
+MAX_REFERENCES: Final = 50  # parameters whose values need each other, in a chain
 MAX_ELEMENTS: Final = 1_000_000  # of a document with its catalogue entries
 BODIES: Final = ("Vehicle", "Pedestrian", "MiscObject")
 _NAME = re.compile(r"\$\{?\s*([^\W\d][\w.]*)\s*\}?")
@@ -145,6 +146,10 @@ class Scope:
         if name in self._open:
             ring = " -> ".join([*self._open[self._open.index(name) :], name])
             raise error_at(declaration, f"the parameter depends on itself: {ring[:200]}")
+        if len(self._open) >= MAX_REFERENCES:
+            raise error_at(
+                declaration, f"parameter '{name[:60]}' ends a chain of more than {MAX_REFERENCES} parameters"
+            )
         self._open.append(name)
         try:
             text = self.assigned.get(name)

@@ -83,15 +83,13 @@ class Entity:
         return MODELS[self.model].max_speed if self.body.max_speed is None else self.body.max_speed
 
 
-def read_entities(
-    root: Element, values: AttributeReader, omissions: Counter[str], *, centred: bool
-) -> dict[str, Entity]:
+def read_entities(root: Element, values: AttributeReader, doubts: Counter[str], *, centred: bool) -> dict[str, Entity]:
     """Return the entities of a document, by name, in its order; one of them is the ego.
 
     Args:
         root: The document.
         values: Reads the attributes of elements.
-        omissions: Counter of the features that are not carried over.
+        doubts: Counter of what changes a motion and is not carried over.
         centred: Positions are those of the bodies' centres, whatever their bounding boxes say.
 
     Raises:
@@ -113,10 +111,10 @@ def read_entities(
                     f"'{reference.get('catalogName')}', which is not there; put it where CatalogLocations says",
                 )
             content = scenario_object[0].tag if len(scenario_object) else "nothing"
-            omissions[f"entity '{name}': a {content} instead of its body: it is taken for a car"] += 1
+            doubts[f"entity '{name}': a {content} instead of its body: it is taken for a car"] += 1
             entities[name] = Entity(name, "car", Body(), (0.0, 0.0), False, scenario_object)
         else:
-            entities[name] = _entity(scenario_object, body, values, omissions, centred=centred)
+            entities[name] = _entity(scenario_object, body, values, doubts, centred=centred)
         type_properties = {
             property_element.get("value", "")
             for property_element in scenario_object.iter("Property")
@@ -129,11 +127,11 @@ def read_entities(
     vehicles = [name for name, entity in entities.items() if _is_driven(entity)]
     egos = [name for name in egos if _is_driven(entities[name])]
     if len(egos) > 1:
-        omissions[f"of {len(egos)} egos only '{egos[0]}' is driven by the system under test"] += 1
+        doubts[f"of {len(egos)} egos only '{egos[0]}' is driven by the system under test"] += 1
     if not egos and not vehicles:
         raise values.error("Entities", "no vehicle could be the ego")
     if not egos:
-        omissions[f"no entity is called ego or hero: '{vehicles[0]}' is taken for it"] += 1
+        doubts[f"no entity is called ego or hero: '{vehicles[0]}' is taken for it"] += 1
     entities[(egos or vehicles)[0]].ego = True
     if len(entities) > MAX_AGENTS:
         raise values.error("Entities", f"{len(entities)} entities; a scene has room for {MAX_AGENTS}")
@@ -146,7 +144,7 @@ def _is_driven(entity: Entity) -> bool:
 
 
 def _entity(
-    scenario_object: Element, body: Element, values: AttributeReader, omissions: Counter[str], *, centred: bool
+    scenario_object: Element, body: Element, values: AttributeReader, doubts: Counter[str], *, centred: bool
 ) -> Entity:
     """Return the entity with a body."""
     name = values.text(scenario_object, "name")
@@ -174,7 +172,7 @@ def _entity(
     stated = {"length": size[0], "width": size[1], "height": size[2]}
     for key, limit in stated.items():
         if not 0.05 <= limit <= 30.0:
-            omissions[f"the {key} of '{name}' of {limit:g} m: that of a {model} is taken"] += 1
+            doubts[f"the {key} of '{name}' of {limit:g} m: that of a {model} is taken"] += 1
             stated[key] = getattr(MODELS[model], key)
     performance = body.find("Performance")
     if performance is not None and MODELS[model].max_speed > 0.0:

@@ -31,7 +31,7 @@ OUTSIDE = 200.0  # m beyond all lanes at which a position is outside the map
 
 
 class PositionReader:
-    """Positions as poses in the world frame; inexact conversions are counted in `omissions`."""
+    """Positions as poses in the world frame; inexact conversions are counted in `doubts`."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class PositionReader:
         town: str,
         shift: tuple[float, float],
         mirrored: bool,
-        omissions: Counter[str],
+        doubts: Counter[str],
         starts: Mapping[str, Element],
     ) -> None:
         """Create the reader of one document.
@@ -52,10 +52,10 @@ class PositionReader:
             town: Its name.
             shift: What is subtracted from world coordinates to get those of the town, m.
             mirrored: World positions are in CARLA's left-handed frame.
-            omissions: Counter of the features that are not carried over.
+            doubts: Counter of what changes a motion and is not carried over.
             starts: Name of an entity -> its position at the start.
         """
-        self.values, self.graph, self.omissions, self.starts = values, graph, omissions, starts
+        self.values, self.graph, self.doubts, self.starts = values, graph, doubts, starts
         self.roads = RoadCoordinates(town, graph)
         self._shift = shift
         self._hand = -1.0 if mirrored else 1.0
@@ -241,7 +241,7 @@ class PositionReader:
         length = float(graph.length[sections].sum())
         if not -EDGE <= s <= length + EDGE:
             raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {map_road} has {length:.1f} m")
-        self.omissions["positions by road and s are taken along the lane, not along the road's reference line"] += 1
+        self.doubts["positions by road and s are taken along the lane, not along the road's reference line"] += 1
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:

@@ -2,7 +2,8 @@
 
 An event that changes a speed becomes a phase, one that changes a lane a lateral phase, with the event's trigger; a
 trajectory with times becomes an actor's own; one without times, or a route, becomes its path. The ego is left to the
-system under test. Features without a counterpart are listed in `ImportedScenario.omissions`.
+system under test. Features without a counterpart are listed: as doubts if they change how an actor moves, when it
+starts, its size, or when the episode ends, else as omissions.
 
 CARLA's ScenarioRunner writes world positions in CARLA's left-handed frame, which a description that begins with
 "CARLA:" indicates, and gives positions of bodies' centres (srunner/tools/openscenario_parser.py of ScenarioRunner).
@@ -53,11 +54,14 @@ class ImportedScenario:
 
     Attributes:
         scenario: The scenario.
-        omissions: Features of the file that are not carried over, one line each.
+        omissions: Features of the file that are not carried over and leave all motions as they are.
+        doubts: What an actor does, when it starts, its size or the end of the episode, where it differs from the file,
+            and what is likely to be wrong in the file.
     """
 
     scenario: Scenario
     omissions: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -84,9 +88,8 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> ImportedSce
     imported = read_openscenario_set(path, map_name=map_name)
     if len(imported.scenarios) != 1:
         raise FormatError(f"{path}: a distribution of {len(imported.scenarios)} scenarios, not one")
-    omissions = imported.report.omissions
-    lines = (f"{reason}{f' ({len(places)} times)' if len(places) > 1 else ''}" for reason, places in omissions.items())
-    return ImportedScenario(imported.scenarios[0], tuple(lines))
+    report = imported.report
+    return ImportedScenario(imported.scenarios[0], tuple(report.omissions), tuple(report.doubts))
 
 
 def read_openscenario_set(
@@ -135,7 +138,12 @@ def read_openscenario_set(
         if key not in maps:
             maps[key] = find_map(resolved, source, report) if map_name is None else DocumentMap(map_name)
         reader = _Reader(source, resolved, parameters, maps[key], report)
-        scenario = reader.read(source.stem, f"/{index + 1:04d}" if is_set else "")
+        try:
+            scenario = reader.read(source.stem, f"/{index + 1:04d}" if is_set else "")
+        except RecursionError:
+            raise FormatError(
+                f"{source}: its conditions are nested too deeply; split them into several events"
+            ) from None
         scenarios.append(scenario)
         if progress is not None:
             progress(index + 1, len(sets))
@@ -155,7 +163,8 @@ class _Reader:
         self.root, self.town, self.report, self.parameters = root, map_.town, report, parameters
         self.graph: LaneGraph = load_town(map_.town)
         self.values = AttributeReader(str(path))
-        self.omissions: Counter[str] = Counter()
+        self.omissions: Counter[str] = Counter()  # what leaves all motions as they are
+        self.doubts: Counter[str] = Counter()
         header = root.find("FileHeader")
         if header is None:
             raise self.values.error("OpenSCENARIO", "FileHeader is missing")
@@ -167,14 +176,14 @@ class _Reader:
             for property_element in header.iter("Property")
         }
         is_carla = self.description.startswith("CARLA:")
-        self.entities = read_entities(root, self.values, self.omissions, centred=is_carla)
+        self.entities = read_entities(root, self.values, self.doubts, centred=is_carla)
         self.places = PositionReader(
             self.values,
             self.graph,
             town=map_.town,
             shift=map_.shift,
             mirrored=is_carla,
-            omissions=self.omissions,
+            doubts=self.doubts,
             starts=self._starts(),
         )
         self.ego = next(entity for entity in self.entities.values() if entity.ego)
@@ -200,6 +209,7 @@ class _Reader:
             self.entities,
             parameters=self.parameters,
             omissions=self.omissions,
+            doubts=self.doubts,
             report=self.report,
         )
         self.storyboard = storyboard
@@ -214,7 +224,7 @@ class _Reader:
         for entity in sorted(self.entities.values(), key=lambda entity: not entity.ego):
             entity.placed = entity.name in self.places.starts or entity.name in self.places.moved
             if not entity.placed and not entity.ego:
-                self.omissions[f"'{entity.name}': it has no position at the start"] += 1
+                self.doubts[f"'{entity.name}': it has no position at the start"] += 1
             if entity.placed:
                 pose = self.places.start(entity.name, within=entity.element)
                 element = self.places.starts.get(entity.name, entity.element)
@@ -251,6 +261,7 @@ class _Reader:
             self.entities,
             parameters=self.parameters,
             omissions=self.omissions,
+            doubts=self.doubts,
             report=self.report,
         )
         forced_signals = self._signals()
@@ -285,7 +296,9 @@ class _Reader:
         except SSADError as error:
             raise type(error)(f"{self.values.location}: {error}") from None
         for message, times in self.omissions.items():
-            self.report.omissions.setdefault(message, []).extend([""] * times)
+            self.report.omit(message, count=times)
+        for message, times in self.doubts.items():
+            self.report.doubt(message, count=times)
         return scenario
 
     def _centre(self, entity: Entity, pose: Pose) -> Pose:
@@ -305,9 +318,9 @@ class _Reader:
                 if entity_action.find("DeleteEntityAction") is not None:
                     self.storyboard.triggers.referenced_entity(entity_action).leaves = 0.0
             elif action.find(".//RoadCondition") is None or len(list(action.iter())) > 8:
-                self.storyboard.record_omission("at the start", action)
+                self.storyboard.record_action("at the start", action)
         for action in self.root.iterfind("Storyboard/Init/Actions/UserDefinedAction"):
-            self.storyboard.record_omission("at the start", action)
+            self.storyboard.record_action("at the start", action)
         return forced_signals
 
     def _friction(self) -> float:
@@ -345,7 +358,8 @@ class _Reader:
                 limits = replace(limits, max_distance=max(self.values.number(distance_condition, "value"), 1.0))
             elif name != "end of the route" and condition.find(".//CollisionCondition") is None:
                 condition_tags = [element.tag for element in condition.iter() if element.tag.endswith("Condition")]
-                self.omissions[f"{condition_tags[-1] if condition_tags else 'a condition'} of the stop trigger"] += 1
+                tag = condition_tags[-1] if condition_tags else "a condition"
+                self.doubts[f"{tag} of the stop trigger is not carried over"] += 1
         if times:
             time = max(min(times), STEP)
             limits = replace(limits, max_time=time, max_steps=math.ceil(time / STEP))
@@ -396,7 +410,7 @@ class _Reader:
                 continue
             if route.length < 1.5 * _length(path) + 20.0:
                 return points
-        self.omissions[f"the trajectory of the ego '{self.ego.name}', which the town's lanes do not allow"] += 1
+        self.doubts[f"the trajectory of the ego '{self.ego.name}', which the town's lanes do not allow"] += 1
         return ()
 
     def _with_meetings(self, entity: Entity, route: Route) -> list[Phase]:
@@ -407,7 +421,7 @@ class _Reader:
             arrival, kept = phase.arrival, phase
             is_of_ego = arrival is not None and arrival.reference == "ego"
             if arrival is not None and is_of_ego and _distance(line, arrival.reference_point) > FAR_OFF:
-                self.omissions[f"'{entity.name}' meets the ego at a point that its route does not pass"] += 1
+                self.doubts[f"'{entity.name}' meets the ego at a point that its route does not pass"] += 1
                 kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
             phases.append(kept)
         return phases
@@ -427,13 +441,13 @@ class _Reader:
             entity.rows = ((entity.appears, pose.x, pose.y, pose.yaw), (until + 1.0, pose.x, pose.y, pose.yaw))
             return self._on_trajectory(entity, pose, until)
         if math.isfinite(entity.leaves):
-            self.omissions[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
+            self.doubts[f"DeleteEntityAction of '{entity.name}': it stays"] += 1
         if entity.appears > 0.0:
-            self.omissions[f"AddEntityAction of '{entity.name}': it is there from the start"] += 1
+            self.doubts[f"AddEntityAction of '{entity.name}': it is there from the start"] += 1
         model = MODELS[entity.model]
         if model.max_speed == 0.0:
             if moves or entity.path:
-                self.omissions[f"what '{entity.name}' does: a {entity.model} stands still"] += 1
+                self.doubts[f"what '{entity.name}' does: a {entity.model} stands still"] += 1
             return Actor(entity.name, entity.model, pose)
         if entity.policy:
             path = tuple((point.x, point.y) for point in entity.route) if len(entity.route) > 1 else ()
@@ -460,7 +474,7 @@ class _Reader:
         for phase in entity.phases:
             kept = phase
             if phase.arrival is not None and _distance(line, phase.arrival.point) > FAR_OFF:
-                self.omissions[f"'{entity.name}' meets another at a point that its path does not pass"] += 1
+                self.doubts[f"'{entity.name}' meets another at a point that its path does not pass"] += 1
                 kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
             phases.append(kept)
         return tuple(phases)
@@ -475,7 +489,7 @@ class _Reader:
         elif rows[-1][0] < min(until, entity.leaves):
             rows.append((until + 1.0, *rows[-1][1:]))  # it stays at the end of its trajectory
         if entity.phases or entity.lateral:
-            self.omissions[f"speeds and lanes of '{entity.name}': its trajectory has times"] += 1
+            self.doubts[f"speeds and lanes of '{entity.name}': its trajectory has times"] += 1
         rows = [row for index, row in enumerate(rows) if index == 0 or row[0] > rows[index - 1][0]]
         if len(rows) < 2:
             rows.append((rows[0][0] + STEP, *rows[0][1:]))
@@ -498,7 +512,7 @@ class _Reader:
             try:
                 return tuple((x, y) for x, y in route_along(self.graph, points).xy.tolist())
             except RouteError:
-                self.omissions[f"the route of '{entity.name}', which the town's lanes do not allow"] += 1
+                self.doubts[f"the route of '{entity.name}', which the town's lanes do not allow"] += 1
         place = self.places.lane_under(pose)
         if place is None:
             return ()
@@ -530,7 +544,7 @@ class _Reader:
                 (candidate for candidate in SignalState if candidate.name.lower() == state_name.strip().lower()), None
             )
             if state is None or name not in signal_numbers:
-                self.omissions[f"state '{state_name[:40]}' of signal '{name[:40]}'"] += 1
+                self.doubts[f"state '{state_name[:40]}' of signal '{name[:40]}'"] += 1
             else:
                 forced_states[signal_numbers[name]] = state
         end_time = 60.0
@@ -541,7 +555,7 @@ class _Reader:
                 raise self.values.error("Property", "ssad.signals_until is not a number") from None
         plan = plan_of(self.graph, line, forced_states, end_time)
         if plan is None:
-            self.omissions[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
+            self.doubts[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
 
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 LATERAL_TIME: Final = 3.0  # s of a lateral motion whose dynamics the file does not limit
+MAX_WAITING: Final = 50  # events that wait for each other, in a chain
 MAX_PROFILE: Final = 12  # phases of a speed profile
 _KINDS: Final = ("Story", "Act", "ManeuverGroup", "Maneuver", "Event", "Action")
 _SHAPES: Final = ("linear", "sinusoidal", "cubic", "step")
@@ -51,8 +52,18 @@ _INSTANT: Final = (
     "UserDefinedAction",
     "AssignRouteAction",
 )
+# Actions that change neither the motion of an actor nor when it starts.
+_MOTIONLESS: Final = (
+    "EnvironmentAction",
+    "VisibilityAction",
+    "AppearanceAction",
+    "ParameterAction",
+    "VariableAction",
+    "UserDefinedAction",
+)
 # Actions of the ego that the system under test takes the place of.
 _OF_DRIVER: Final = ("LongitudinalAction", "LateralAction", "SynchronizeAction", "RoutingAction", "ControllerAction")
+_OF_CONTROLLER: Final = ("ActivateControllerAction", "OverrideControllerValueAction")
 
 
 @dataclass
@@ -92,7 +103,11 @@ class Motion:
 
 
 class StoryboardReader:
-    """Storyboard of a document; what has no counterpart is counted in `omissions`."""
+    """Storyboard of a document.
+
+    What has no counterpart is counted: in `doubts` if it changes how an actor moves or when it starts, else in
+    `omissions`.
+    """
 
     def __init__(
         self,
@@ -102,16 +117,17 @@ class StoryboardReader:
         *,
         parameters: Mapping[str, str],
         omissions: Counter[str],
+        doubts: Counter[str],
         report: ImportReport,
     ) -> None:
         """Create the reader of one document; see `TriggerReader`."""
         self.root, self.places, self.entities = root, places, entities
-        self.values, self.omissions, self.report = places.values, omissions, report
+        self.values, self.omissions, self.doubts, self.report = places.values, omissions, doubts, report
         self.triggers = TriggerReader(
             places,
             entities,
             parameters=parameters,
-            omissions=omissions,
+            doubts=doubts,
             report=report,
             element_state=self._element_state,
         )
@@ -185,9 +201,9 @@ class StoryboardReader:
         for story_element in (event, *([group] if group else [])):
             execution_count = self.values.number(story_element.element, "maximumExecutionCount", 1.0)
             if execution_count > 1 and has_phases:
-                self.omissions[f"'{story_element.path[-1]}' takes place once, not up to {execution_count:g} times"] += 1
+                self.doubts[f"'{story_element.path[-1]}' takes place once, not up to {execution_count:g} times"] += 1
         if self.values.text(event.element, "priority", "override") == "skip" and has_phases:
-            self.omissions[f"priority 'skip' of '{event.path[-1]}': it takes place beside other events"] += 1
+            self.doubts[f"'{event.path[-1]}' takes place beside other events, not only where none runs (skip)"] += 1
 
     def _initial(self, private: Element) -> None:
         """Carry out the actions of an entity at the start."""
@@ -232,20 +248,24 @@ class StoryboardReader:
                 if name in ("autopilot", "blind") and "target_speed" in properties:
                     entity.policy = name
                 else:
-                    self.omissions[f"controller '{name}' of '{entity.name}'"] += 1
+                    self.doubts[f"controller '{name}' of '{entity.name}' is not carried over"] += 1
         if action.find(".//CatalogReference") is not None and not entity.ego:
-            self.omissions[f"controller of '{entity.name}' in a catalogue"] += 1
+            self.doubts[f"controller of '{entity.name}' in a catalogue is not carried over"] += 1
 
-    def record_omission(self, context: str, action: Element) -> None:
+    def record_action(self, context: str, action: Element, *, is_of_ego: bool = False) -> None:
         """Name an action that has no counterpart: the innermost element whose name says what it does."""
         action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
-        self.omissions[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
+        reason = f"{(action_tags or [action.tag])[-1]} {context}"
+        if _is_motionless(action) or (is_of_ego and {*action_tags, action.tag} & {*_OF_DRIVER, *_OF_CONTROLLER}):
+            self.omissions[reason] += 1
+        else:
+            self.doubts[f"{reason} is not carried over"] += 1
 
     def _global(self, action: Element, event: StoryElement) -> None:
         entity_action = action.find("EntityAction")
         label = event.path[-1]
         if entity_action is None:
-            self.record_omission(f"in event '{label}'", action)
+            self.record_action(f"in event '{label}'", action)
             return
         entity = self.triggers.referenced_entity(entity_action)
         time = self._time(self._begin(event, entity))
@@ -253,7 +273,7 @@ class StoryboardReader:
         if time is None or math.isinf(time):
             if time is None:
                 stays = "it is there from the start" if is_arrival else "it stays"
-                self.omissions[f"{'Add' if is_arrival else 'Delete'}EntityAction of '{entity.name}': {stays}"] += 1
+                self.doubts[f"{'Add' if is_arrival else 'Delete'}EntityAction of '{entity.name}': {stays}"] += 1
         elif is_arrival:
             entity.appears = time
         else:
@@ -291,9 +311,7 @@ class StoryboardReader:
         if ALWAYS in (own_trigger, act_trigger) or not isinstance(own_trigger, PhaseTrigger):
             return both(own_trigger, act_trigger)
         if isinstance(act_trigger, PhaseTrigger) and not is_lasting(act_trigger):
-            self.omissions[
-                f"that act '{act.path[-1]}' goes on after its trigger: '{label}' needs it still to hold"
-            ] += 1
+            self.doubts[f"that act '{act.path[-1]}' goes on after its trigger: '{label}' needs it still to hold"] += 1
         return both(act_trigger, own_trigger)
 
     def _around(self, story_element: StoryElement, tag: str) -> StoryElement | None:
@@ -344,13 +362,13 @@ class StoryboardReader:
         return any_of([self._guarded(event, content, label, partial(self._event_start, event)) for event in events])
 
     def _takes_place(self, event: StoryElement, content: Element, label: str) -> Trigger:
-        """Return the start of an event, for whether it has one; nothing is counted as an omission."""
-        counted = dict(self.omissions)
+        """Return the start of an event, for whether it has one; nothing is counted as a doubt."""
+        counted = dict(self.doubts)
         try:
             return self._guarded(event, content, label, partial(self.start, event, None))
         finally:
-            self.omissions.clear()
-            self.omissions.update(counted)
+            self.doubts.clear()
+            self.doubts.update(counted)
 
     def _act_start(self, act: StoryElement) -> Trigger:
         return self.triggers.trigger(act.element.find("StartTrigger"), None, act.path[-1])
@@ -358,7 +376,7 @@ class StoryboardReader:
     def _event_start(self, event: StoryElement) -> Trigger:
         trigger = self.start(event, None)
         if isinstance(trigger, PhaseTrigger) and not is_lasting(trigger):
-            self.omissions[f"that event '{event.path[-1]}' has begun is taken as its trigger"] += 1
+            self.doubts[f"that event '{event.path[-1]}' has begun is taken as its trigger"] += 1
         return trigger
 
     def _guarded(
@@ -370,6 +388,8 @@ class StoryboardReader:
             return self._starts[key]
         if key in self._open:
             return self.triggers.never(content, label, "events wait for each other")
+        if len(self._open) >= MAX_WAITING:
+            raise self.values.error(content, f"'{label}' ends a chain of more than {MAX_WAITING} events that wait")
         self._open.add(key)
         try:
             result = make()
@@ -405,7 +425,7 @@ class StoryboardReader:
             return trigger
         tags = {element.tag for element in action.element.iter()}
         if action.duration is None and not tags & set(_INSTANT):
-            self.omissions[f"the end of '{action.path[-1]}', which '{label}' waits for, is taken as its start"] += 1
+            self.doubts[f"the end of '{action.path[-1]}', which '{label}' waits for, is taken as its start"] += 1
         if not action.duration:
             return trigger
         if trigger == ALWAYS:
@@ -463,19 +483,22 @@ class StoryboardReader:
         if entity.ego:
             tags = {element.tag for element in (content, *content)}
             routing = content if content.tag == "RoutingAction" else content.find("RoutingAction")
-            trigger = self._begin(event, entity)
+            trigger = Unfulfilled.UNKNOWN if routing is None else self._begin(event, entity)
             if routing is not None and isinstance(trigger, PhaseTrigger) and not (entity.route or entity.path):
                 self._routing(entity, routing, action, trigger, f"event '{label}'")
             elif tags & set(_OF_DRIVER) - {"ControllerAction"}:
                 self.omissions[f"event '{label}' of the ego: the system under test drives it"] += 1
             elif "ControllerAction" not in tags:
-                self.record_omission(f"in event '{label}'", content)
+                self.record_action(f"in event '{label}'", content, is_of_ego=True)
+            return
+        if _is_motionless(content):
+            self.record_action(f"in event '{label}'", content)
             return
         trigger = self._begin(event, entity)
         if trigger is Unfulfilled.NEVER:
             return
         if trigger is Unfulfilled.UNKNOWN:
-            self.omissions[f"event '{label}': when it begins is not known"] += 1
+            self.doubts[f"event '{label}': when it begins is not known"] += 1
             return
         self._carry_out(motion, content, action, trigger=trigger, label=f"event '{label}'")
 
@@ -499,7 +522,8 @@ class StoryboardReader:
             if entity.ego and inner_action.tag in _OF_DRIVER:
                 self.omissions[f"{inner_action.tag} at {label}: the system under test drives the ego"] += 1
             else:
-                self.record_omission(f"at {label}" if label.startswith("the start") else f"in {label}", content)
+                context = f"at {label}" if label.startswith("the start") else f"in {label}"
+                self.record_action(context, content, is_of_ego=entity.ego)
 
     def _limited_speed(self, entity: Entity, speed: float) -> float:
         """Return a speed that the entity can have; a file without limits of its own sets them by its speeds."""
@@ -508,7 +532,7 @@ class StoryboardReader:
             entity.body = replace(entity.body, max_speed=speed)
             limit = speed
         if not 0.0 <= speed <= limit and not entity.ego:
-            self.omissions[f"a speed of '{entity.name}' of {speed:g} m/s: it has 0 to {limit:g} m/s"] += 1
+            self.doubts[f"a speed of '{entity.name}' of {speed:g} m/s: it has 0 to {limit:g} m/s"] += 1
         return min(max(speed, 0.0), limit) if not entity.ego else max(speed, 0.0)
 
     def _speed_phase(self, entity: Entity, action: Element) -> Phase | None:
@@ -598,7 +622,7 @@ class StoryboardReader:
         for tag, body in (("TargetPosition", entity), ("TargetPositionMaster", master)):
             position = action.find(tag)
             if not self.places.is_supported(position):
-                self.omissions[f"SynchronizeAction of '{entity.name}': a position that is not read"] += 1
+                self.doubts[f"SynchronizeAction of '{entity.name}': a position that is not read"] += 1
                 return []
             poses.append(self._centre(body, self.places.pose(position, within=action)))
         absolute = action.find("FinalSpeed/AbsoluteSpeed")
@@ -607,7 +631,7 @@ class StoryboardReader:
             speed = self._limited_speed(entity, self.values.number(absolute, "value"))
             poses = self._before_steady_state(action, poses, speed=speed, master=master)
         elif action.find("FinalSpeed/RelativeSpeedToMaster") is not None:
-            self.omissions[f"the final speed of '{entity.name}', which depends on that of '{master.name}'"] += 1
+            self.doubts[f"the final speed of '{entity.name}', which depends on that of '{master.name}'"] += 1
         own_place, other_place = ((pose.x, pose.y) for pose in poses)
         return [Phase(speed, arrival=Arrival(own_place, other_place, self.triggers.agent_name(master)))]
 
@@ -630,7 +654,7 @@ class StoryboardReader:
         back = master.speed * distance / speed
         start = self._centre(master, self.places.start(master.name, within=action))
         if back <= 0.0 or back >= math.dist((start.x, start.y), (other_place.x, other_place.y)):
-            self.omissions[f"the steady state before the meeting with '{master.name}'"] += 1
+            self.doubts[f"the steady state before the meeting with '{master.name}'"] += 1
             return poses
         return [
             self._earlier(action.find("TargetPosition"), own_place, distance),
@@ -669,7 +693,7 @@ class StoryboardReader:
         else:
             raise self.values.error(action, "LaneChangeTarget is missing")
         if total is None:
-            self.omissions[f"LaneChangeAction of '{entity.name}': its target lane is not beside its own"] += 1
+            self.doubts[f"LaneChangeAction of '{entity.name}': its target lane is not beside its own"] += 1
             return None
         self._lanes[entity.name] = total
         phase = LateralPhase(total - before, offset=self.values.number(action, "targetLaneOffset", 0.0))
@@ -731,9 +755,7 @@ class StoryboardReader:
             raise self.values.error(action, "LaneOffsetTarget is missing")
         value = self.values.number(target, "value")
         if relative is not None and absolute is None and self.triggers.referenced_entity(relative) is not entity:
-            self.omissions[
-                f"the lane offset of '{entity.name}' relative to another is taken from the lane's centre"
-            ] += 1
+            self.doubts[f"the lane offset of '{entity.name}' relative to another is taken from the lane's centre"] += 1
         phase = LateralPhase(0, offset=value)
         before, self._offsets[entity.name] = self._offsets.get(entity.name, 0.0), value
         dynamics = action.find("LaneOffsetActionDynamics")
@@ -764,9 +786,9 @@ class StoryboardReader:
             if not continuous:
                 return
         if not continuous and not dynamic:
-            self.omissions[f"LongitudinalDistanceAction in {label}: '{entity.name}' does not jump"] += 1
+            self.doubts[f"LongitudinalDistanceAction in {label}: '{entity.name}' does not jump"] += 1
             return
-        self.omissions[f"the distance of '{entity.name}' to '{other.name}': it follows its speed only"] += 1
+        self.doubts[f"the distance of '{entity.name}' to '{other.name}': it follows its speed only"] += 1
         name = self._name(StoryElement(action, (label,), None), entity)
         reference = self.triggers.agent_name(other)
         entity.phases.append(Phase(0.0, trigger, name=name, reference=reference, continuous=continuous, anytime=True))
@@ -826,18 +848,18 @@ class StoryboardReader:
         elif inner_action.tag == "FollowTrajectoryAction":
             self._trajectory(entity, inner_action, action, trigger, label)
             return
-        self.record_omission(f"of '{entity.name}'", routing)
+        self.record_action(f"of '{entity.name}'", routing)
 
     def _note_late(self, trigger: PhaseTrigger, label: str, does: str, entity: Entity) -> None:
         if trigger != ALWAYS and not is_lasting(trigger):
-            self.omissions[f"the trigger of {label}: '{entity.name}' {does}"] += 1
+            self.doubts[f"the trigger of {label}: '{entity.name}' {does}"] += 1
 
     def _trajectory(
         self, entity: Entity, follow: Element, action: StoryElement, trigger: PhaseTrigger, label: str
     ) -> None:
         way = self.find_trajectory(follow, entity)
         if way is None:
-            self.omissions[f"a trajectory of '{entity.name}' that is not read"] += 1
+            self.doubts[f"a trajectory of '{entity.name}' that is not read"] += 1
             return
         poses = [self._centre(entity, Pose(*row)) for row in np.column_stack([way.xy, way.yaw]).tolist()]
         if entity.ego:
@@ -846,7 +868,7 @@ class StoryboardReader:
         timing = follow.find("TimeReference/Timing")
         if timing is None or way.times is None:
             if timing is not None:
-                self.omissions[f"the times of the trajectory of '{entity.name}': its points have none"] += 1
+                self.doubts[f"the times of the trajectory of '{entity.name}': its points have none"] += 1
             entity.path = tuple(poses)
             self._note_late(trigger, label, "keeps that path from the start", entity)
             return
@@ -881,7 +903,7 @@ class StoryboardReader:
         speeds = steps / np.maximum(np.diff(times), 1e-3)
         edges = np.unique(np.linspace(0, len(speeds), min(len(speeds), MAX_PROFILE) + 1).astype(int))
         if len(edges) - 1 < len(speeds):
-            self.omissions[f"the speeds of the trajectory of '{entity.name}' are means of its parts"] += 1
+            self.doubts[f"the speeds of the trajectory of '{entity.name}' are means of its parts"] += 1
         previous, previous_first = "", 0
         for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             speed = self._limited_speed(entity, float(steps[first:last].sum() / max(times[last] - times[first], 1e-3)))
@@ -915,6 +937,18 @@ class StoryboardReader:
             np.concatenate([[0.0], way.s[rest_index:] - skipped]),
             times,
         )
+
+
+def _is_motionless(action: Element) -> bool:
+    """Return whether an action leaves all motions as they are, such as one of the weather."""
+    if any(element.tag in _MOTIONLESS for element in action.iter()):
+        return True
+    activations = list(action.iter("ActivateControllerAction"))
+    return bool(activations) and not any(
+        activation.get(domain, "false").strip() in ("true", "1")
+        for activation in activations
+        for domain in ("lateral", "longitudinal")
+    )
 
 
 def _with_trigger(phases: Sequence, trigger: PhaseTrigger) -> list:  # type: ignore[type-arg]

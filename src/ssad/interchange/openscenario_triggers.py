@@ -122,7 +122,7 @@ def _implies(trigger: PhaseTrigger, other_trigger: PhaseTrigger) -> bool:
 
 
 class TriggerReader:
-    """The triggers of a document; triggers without a counterpart are counted in `omissions`."""
+    """The triggers of a document; triggers without a counterpart are counted in `doubts`."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class TriggerReader:
         entities: Mapping[str, Entity],
         *,
         parameters: Mapping[str, str],
-        omissions: Counter[str],
+        doubts: Counter[str],
         report: ImportReport,
         element_state: Callable[[Element, str], Trigger],
     ) -> None:
@@ -140,11 +140,11 @@ class TriggerReader:
             places: Reads positions.
             entities: By name.
             parameters: Values of the document's parameters.
-            omissions: Counter of the features that are not carried over.
+            doubts: Counter of what changes a motion and is not carried over.
             report: Filled with triggers that can never hold.
             element_state: Returns the trigger of a StoryboardElementStateCondition, whose delay and edge are left out.
         """
-        self.values, self.places, self.entities, self.omissions = places.values, places, entities, omissions
+        self.values, self.places, self.entities, self.doubts = places.values, places, entities, doubts
         self.parameters, self.report, self._element_state = parameters, report, element_state
         self.ego = next(entity for entity in entities.values() if entity.ego)
         # As conditions of the kind `ego_distance` count.
@@ -178,7 +178,7 @@ class TriggerReader:
             return ALWAYS
         result = any_of(alternatives)
         if result is Unfulfilled.UNKNOWN:
-            self.omissions[f"the trigger of '{label}'"] += 1
+            self.doubts[f"the trigger of '{label}' is not carried over"] += 1
         return result
 
     def _condition(self, condition: Element, entity: Entity | None, label: str) -> Trigger:
@@ -198,7 +198,7 @@ class TriggerReader:
         else:
             result = self._by_value(content, label)
         if result is Unfulfilled.UNKNOWN:
-            self.omissions[f"{content.tag} of the trigger of '{label}'"] += 1
+            self.doubts[f"{content.tag} of the trigger of '{label}' is not carried over"] += 1
         if not isinstance(result, PhaseTrigger):
             return result
         if edge == "falling" and is_lasting(result):

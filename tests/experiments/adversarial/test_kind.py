@@ -25,7 +25,7 @@ from ssad.core.traces import load_trace
 from ssad.drivers import make_system
 from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
-from ssad.experiments.adversarial.found_collisions import has_proof, ranked_collisions
+from ssad.experiments.adversarial.found_collisions import has_proof, proven_bases, ranked_collisions
 from ssad.experiments.adversarial.kind import Adversarial
 from ssad.experiments.adversarial.search_scores import distinct_collisions, summary
 from ssad.experiments.runs import write_report
@@ -100,7 +100,7 @@ def replay(*, end: str = "collision", yaw: float = 0.0, ego_speed: float = 8.0) 
         contact_agent=np.where(contact, 1, -1).astype(np.int32),
         end=end,
     )
-    return SimpleNamespace(scenario=SCENARIO, graph=graph, trace=trace)
+    return SimpleNamespace(scenario=SCENARIO, graph=graph, trace=trace, episode=None)
 
 
 def test_a_base_has_a_proof_if_a_saved_collision_meets_every_condition_again() -> None:
@@ -128,6 +128,26 @@ def test_collisions_that_may_be_proven_are_saved_first() -> None:
     standing, moving = outcome(replay(ego_speed=0.0)), outcome(replay())
     assert ranked_collisions([standing, moving], base) == [moving, standing]
     assert ranked_collisions([dataclasses.replace(moving, off_road=True), standing], base) == [standing]
+
+
+def test_candidates_alone_are_driven_again_and_graded(monkeypatch: pytest.MonkeyPatch) -> None:
+    drives = [replay(), replay(ego_speed=0.0), replay(), replay()]
+    bases: Any = [SimpleNamespace(graph=drive.graph, episode=SimpleNamespace(seed=7)) for drive in drives]
+    rows = [
+        [Outcome(Proposal(SCENARIO), trace=drive.trace, adversaries=(1,), collision=True, time=3.0)] for drive in drives
+    ]
+    driven: list[Any] = []
+
+    def drive_again(episodes: Any) -> list[Any]:
+        driven.extend(episodes)
+        return [replay(), replay(), replay(end="complete")]
+
+    graded = [SimpleNamespace(metrics=lambda: AVOIDED), SimpleNamespace(metrics=lambda: dict.fromkeys(AVOIDED, 0.0))]
+    monkeypatch.setattr("ssad.scenarios.dynamic.generate.scenario_of", lambda outcome, base, name: outcome)
+    monkeypatch.setattr("ssad.simulators.closed_loop.grades_of", lambda drives, device: graded[: len(drives)])
+    trials: Any = SimpleNamespace(bases=drive_again, device="cpu")
+    assert proven_bases(bases, rows, trials, limit=1) == [True, False, False, False]
+    assert [(outcome, seed) for outcome, _, seed in driven] == [(rows[k][0], 8) for k in (0, 2, 3)]
 
 
 def test_generators_and_systems_meet_the_same_bases_with_the_same_seeds() -> None:

@@ -114,7 +114,10 @@ def test_the_generations_of_cma_es_do_not_depend_on_the_batch(batch: int, base: 
 
 def test_a_scenario_without_parameters_of_others_is_told_in_a_line(base: Base) -> None:
     custom = dataclasses.replace(base.scenario, type="Custom", parameters={})
-    with pytest.raises(ConfigError, match=r"Custom has no parameters of other agents to search; take one of .* king"):
+    with pytest.raises(
+        ConfigError,
+        match=r"no parameters of other agents to search; declare some with a range .* king and cat",
+    ):
         ParameterBox.of(custom)
 
 

@@ -31,6 +31,7 @@ from ssad.scenarios.dynamic.knowledge._impact import place_actors
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import move_pose
 from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
+from ssad.scenarios.dynamic.knowledge.vulnerable_users import draw_cyclists, draw_walkers
 from ssad.scenarios.dynamic.sampling import sample_parameters
 from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import agent_model
@@ -118,6 +119,11 @@ def _build_one(
             with_driver(agent, scenario.seed, draw, number, errors=scenario.traffic.errors)
             for number, agent in enumerate(other_agents)
         ]
+    if scenario.traffic:
+        key = (scenario.seed, draw)
+        cyclists = draw_cyclists(scenario.traffic, graph, route, other_agents, *key)
+        walkers = draw_walkers(scenario.traffic, graph, route, scenario.limits.max_time, *key)
+        other_agents = [*other_agents, *cyclists, *walkers]
     if scenario.signals.ego == "red" and not graph.turn_on_red[0] and near_side_turns(graph, route):
         raise RouteError(
             f"scenario {scenario.name}: its ego turns on red, which town '{graph.name}' forbids; choose another"

@@ -57,6 +57,7 @@ _DERIVED = ("declared", "expressions")  # fields of a scenario that stand elsewh
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+=\-]*(/[A-Za-z0-9_][A-Za-z0-9_.:@+=\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
+_MAX_TRAFFIC = 62  # agents besides the ego: a world keeps contacts as one bit an agent
 _BODY_LIMITS = {
     "length": (0.1, 30.0, "m"),
     "width": (0.1, 5.0, "m"),
@@ -295,6 +296,11 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         yield ("traffic", "minimum"), f"{traffic.minimum} is outside 0 to 64"
     if not traffic.minimum <= traffic.maximum <= 64:
         yield ("traffic", "maximum"), f"{traffic.maximum} is outside minimum ({traffic.minimum}) to 64"
+    for key, count in (("walkers", traffic.walkers), ("cyclists", traffic.cyclists)):
+        if not 0 <= count <= 40:
+            yield ("traffic", key), f"{count} is outside 0 to 40"
+    if traffic.walkers + traffic.cyclists > 0 and traffic.maximum + traffic.walkers + traffic.cyclists > _MAX_TRAFFIC:
+        yield ("traffic", "maximum"), f"vehicles, walkers and cyclists are more than {_MAX_TRAFFIC}; lower one of them"
     if not traffic.wake_distance >= 0.0:
         yield ("traffic", "wake_distance"), "must not be negative"
     if traffic.draw is not None and traffic.draw < 0:

@@ -1,0 +1,157 @@
+"""Walkers and cyclists of natural traffic: off by default, keyed, where they belong, and as fast as published."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import generator
+from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Scenario, TrafficPlan
+from ssad.drivers.builtin import Autopilot
+from ssad.metrics.human_driving import spread
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.scenarios.dynamic.knowledge.natural_junction import APART
+from ssad.scenarios.dynamic.knowledge.vulnerable_users import (
+    GROUP_SLOWER,
+    NEAR,
+    draw_walkers,
+    group_size,
+    walking_speed,
+)
+from ssad.scenarios.dynamic.schema import check, scenario_data
+from ssad.world.roads import LaneGraph, load_town, random_route
+from ssad.world.rollout import rollout
+from ssad.world.world import World
+
+SCENARIO = load_scenarios("natural")[0]
+GRAPH = load_town(SCENARIO.town)
+
+
+def with_plan(**plan: Any) -> Scenario:
+    return replace(SCENARIO, traffic=replace(SCENARIO.traffic or TrafficPlan(), **plan))
+
+
+@pytest.fixture(scope="module")
+def crowd() -> Episode:
+    return build_episode(with_plan(walkers=12, cyclists=3), GRAPH, seed=3)
+
+
+def start_distance(first: EpisodeAgent, second: EpisodeAgent) -> float:
+    return math.hypot(first.pose.x - second.pose.x, first.pose.y - second.pose.y)
+
+
+def sidewalk_distance(graph: LaneGraph, points: np.ndarray) -> np.ndarray:
+    """Distance of points [n, 2] from the centre line of the nearest sidewalk, m."""
+    lanes = np.flatnonzero(graph.kind == LaneType.SIDEWALK)
+    lines = [graph.along(int(lane), np.arange(0.0, float(graph.length[lane]), 0.5))[:, :2] for lane in lanes]
+    return np.asarray(np.hypot(*(points[:, None] - np.concatenate(lines)[None]).transpose(2, 0, 1)).min(axis=1))
+
+
+def test_plans_without_walkers_and_cyclists_are_written_as_before() -> None:
+    for defaults in (False, True):
+        traffic = scenario_data(with_plan(maximum=7), defaults=defaults)["traffic"]
+        assert not {"walkers", "cyclists"} & set(traffic)
+    assert scenario_data(with_plan(walkers=2))["traffic"]["walkers"] == 2
+
+
+def test_the_vehicles_do_not_change_with_the_walkers(crowd: Episode) -> None:
+    vehicles = build_episode(SCENARIO, GRAPH, seed=3).agents
+    for agent, vehicle in zip(crowd.agents, vehicles, strict=False):
+        assert agent.route is not None
+        assert vehicle.route is not None
+        assert replace(agent, route=None) == replace(vehicle, route=None)
+        assert np.array_equal(agent.route.xy, vehicle.route.xy)
+    assert [agent.model for agent in crowd.agents[len(vehicles) :]] == ["bicycle"] * 3 + ["walker"] * 12
+
+
+def test_a_draw_depends_on_its_number_alone() -> None:
+    draws = [
+        build_episode(with_plan(walkers=12, draw=draw), GRAPH, seed=seed) for draw, seed in ((1, 3), (1, 4), (2, 3))
+    ]
+    poses = [[agent.pose for agent in episode.agents if agent.model == "walker"] for episode in draws]
+    assert poses[0] == poses[1]
+    assert not set(poses[0]) & set(poses[2])
+
+
+def test_walkers_start_on_sidewalks_near_the_route(crowd: Episode) -> None:
+    walkers = [agent for agent in crowd.agents if agent.model == "walker"]
+    points = np.array([(agent.pose.x, agent.pose.y) for agent in walkers])
+    assert sidewalk_distance(GRAPH, points).max() < 1.0
+    route = crowd.agents[0].route
+    assert route is not None
+    distances = np.hypot(*(points[:, None] - route.xy[None]).transpose(2, 0, 1)).min(axis=1)
+    assert distances.max() < NEAR + 5.0
+    assert min(start_distance(*pair) for pair in itertools.combinations(walkers, 2)) > 0.5
+
+
+def test_walkers_keep_their_speed_and_stay_on_the_sidewalk(crowd: Episode) -> None:
+    trace = rollout(World([crowd], {GRAPH.name: GRAPH}), Autopilot())[0]
+    walkers = [index for index, agent in enumerate(crowd.agents) if agent.controller == Controller.SCRIPT]
+    assert np.abs(trace.speed[:, walkers] - [crowd.agents[index].speed for index in walkers]).max() < 1e-5
+    ways = np.hypot(np.ptp(trace.x[:, walkers], axis=0), np.ptp(trace.y[:, walkers], axis=0))
+    assert ways.min() > 2.0
+    places = np.stack([trace.x[::20, walkers], trace.y[::20, walkers]], -1).reshape(-1, 2)
+    assert sidewalk_distance(GRAPH, places).max() < 1.5
+    assert trace.end == "complete"
+
+
+def test_groups_are_as_frequent_as_published() -> None:
+    sizes = np.array([group_size(generator("sizes", number)) for number in range(1000)])
+    low, high = spread("share of walkers in groups")
+    assert low < sizes[sizes > 1].sum() / sizes.sum() < high
+
+
+def test_walkers_are_as_fast_as_published_and_slower_in_groups() -> None:
+    alone, together = (
+        np.array([walking_speed(size, generator("speed", number)) for number in range(400)]) for size in (1, 2)
+    )
+    assert abs(alone.mean() - 1.34) < 0.04
+    assert abs(alone.std() - 0.26) < 0.03
+    assert abs(alone.mean() - together.mean() - GROUP_SLOWER) < 0.04
+
+
+def test_members_of_a_group_walk_side_by_side_at_one_speed() -> None:
+    episode = build_episode(with_plan(walkers=30), GRAPH, seed=1)
+    walkers = [agent for agent in episode.agents if agent.model == "walker"]
+    pairs = [
+        (first, second)
+        for first, second in itertools.pairwise(walkers)
+        if first.speed == second.speed and start_distance(first, second) < 1.0
+    ]
+    assert len(pairs) >= 5
+    assert all(abs(first.pose.yaw - second.pose.yaw) < 0.5 for first, second in pairs)
+
+
+def test_cyclists_are_as_fast_as_published_and_keep_apart(crowd: Episode) -> None:
+    low, high = spread("cycling speed")
+    for agent in (agent for agent in crowd.agents if agent.model == "bicycle"):
+        assert agent.controller == Controller.AUTOPILOT
+        assert low <= agent.target_speed <= high
+        others = [other for other in crowd.agents if other is not agent and other.model != "walker"]
+        assert min(start_distance(agent, other) for other in others) >= APART
+
+
+def test_a_town_without_sidewalks_has_no_walkers() -> None:
+    track = load_town("HighSpeedTrack")
+    lane = int(np.flatnonzero((track.kind == LaneType.DRIVING) & (track.junction < 0))[0])
+    route = random_route(track, lane, 0.0, 200.0, generator("route"))
+    assert draw_walkers(TrafficPlan(walkers=5), track, route, 30.0, "key") == []
+
+
+@pytest.mark.parametrize(
+    ("plan", "problem"),
+    [
+        ({"walkers": -1}, "-1 is outside 0 to 40"),
+        ({"cyclists": 41}, "41 is outside 0 to 40"),
+        ({"walkers": 30, "cyclists": 20}, "more than 62"),
+    ],
+)
+def test_impossible_numbers_are_refused(plan: dict[str, int], problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        check(with_plan(**plan))
