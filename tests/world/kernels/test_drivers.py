@@ -114,7 +114,7 @@ def test_who_gives_way_leaves_a_margin_and_stops_beside_the_corridor() -> None:
         world.step()
         pose = world.array("pose")
         braking = np.maximum(braking, -world.array("accel")[:, 1])
-        inside = np.abs(pose[:, 2, 1]) < 2.0 * HALF
+        inside = np.abs(pose[:, 2, 1]) < HALF + 1.0
         gap = np.where(inside, np.minimum(gap, np.abs(pose[:, 1, 0] - 150.0)), gap)
     assert braking.max() < 1.0
     assert gap.min() > 9.0
