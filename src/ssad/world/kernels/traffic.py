@@ -72,6 +72,7 @@ MOST_MARGIN = wp.constant(12)  # strides of it at most, with what the other may 
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
 STILL_STOPS = wp.constant(5.0)  # m/s^2 of who brakes for the conflict already
+TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
 BRAKES = wp.constant(1.0)  # m/s^2
 COMMITTED = wp.constant(3.0)  # m/s^2: who would have to brake harder before a conflict goes on
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -865,7 +866,9 @@ def react_to_agents(
                     if j < agents:
                         other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
                 if j < agents:
-                    waits = perceived.speed[b, j] < CREEPS and state.accel[b, j] < -0.1
+                    waits = (perceived.speed[b, j] < CREEPS and state.accel[b, j] < -0.1) or (
+                        perceived.speed[b, j] < TURNS and state.accel[b, j] < -BRAKES
+                    )
             conflict = conflict_gap(
                 roads,
                 perceived,
