@@ -294,6 +294,10 @@ NOT_OBJECTS: dict[str, str] = {
     "TargetTable.name": "the suite's own name",
     # choices that the kinds themselves make, in code of their own
     "ScenarioSuite.cluster": "what is drawn independently",
+    "ScenarioSuite.sweep": "values of parameters, or the word `grid`",
+    "ScenarioSuite.sweep_mode": "how the values of a sweep are combined",
+    "ScenarioSuite.matrix": "parameters of a sweep",
+    "ScenarioSuite.matrix_metric": "a column of the kind",
     "DrivingSuite.pictures": "pictures of the report",
     "HowOftenSuite.methods": "estimators, which branch the world",
     "DetectionSuite.calibration": "tables of severities of SSAD's shifts",

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.command import ssad
+from helpers.openscenario import LENGTH as ROAD_LENGTH
 from helpers.openscenario import by_entity, by_time, document, event, lane_position, speed_action, start, write
 
 from ssad.core.errors import FormatError
@@ -249,6 +250,66 @@ def test_a_trigger_that_never_fires_is_named_with_its_line(condition: str, reaso
     assert refused.returncode == 2
     assert len(refused.stderr.splitlines()) == 1
     assert not (tmp_path / "out.yaml").exists()
+
+
+BRAKE = speed_action(0, "linear", "rate", 3)
+TRAVELLED = by_entity("Target", '<TraveledDistanceCondition value="20"/>')
+
+
+@pytest.mark.parametrize(
+    ("action", "condition", "message"),
+    [
+        (BRAKE, by_time(3, rule="moreThan"), "SimulationTimeCondition: rule is 'moreThan'; known: greaterThan, "),
+        (BRAKE, TRAVELLED.replace('Rule="any"', 'Rule="some"'), "triggeringEntitiesRule is 'some'; known: any, all, "),
+        (speed_action(0, "linear", "time", -2), by_time(3), "SpeedActionDynamics: value is -2; a time is not negative"),
+        (lane_change(0, "linear", "distance", -2), by_time(3), "value is -2; a distance is not negative"),
+    ],
+)
+def test_values_that_the_standard_excludes_are_refused(
+    action: str, condition: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(FormatError, match=r"test\.xosc:\d+: ") as error:
+        actor_of(tmp_path, event("it", action, condition))
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("speed", "offset", "action", "condition", "doubt"),
+    [
+        (50, 0, BRAKE, by_time(3), "the ego starts with a speed of 40 m/s, not 50 m/s"),
+        (15, 1.6, BRAKE, by_time(3), "the ego starts with a distance to the left of its route of 1 m, not 1.6 m"),
+        (15, 0, BRAKE, by_time(70), "event 'it' of 'Target' waits for 70 s; the episode ends at 60 s"),
+        (15, 0, BRAKE, by_time(3, rule="notEqualTo"), "the trigger of 'it' is not carried over"),
+        (15, 0, BRAKE, TRAVELLED.replace('"any"', '"none"'), "the trigger of 'it' is not carried over"),
+        (
+            15,
+            0,
+            speed_action(0, "linear", "rate", 0),
+            by_time(3),
+            "the speed of 'Target' stays as it is: its rate is 0",
+        ),
+        (
+            15,
+            0,
+            BRAKE.replace('dynamicsDimension="rate"', ""),
+            by_time(3),
+            "dynamicsDimension is missing: taken as time",
+        ),
+    ],
+)
+def test_what_drives_otherwise_than_stated_is_a_doubt(
+    speed: float, offset: float, action: str, condition: str, doubt: str, tmp_path: Path
+) -> None:
+    starts = start("Ego", lane_position(-1, 20, offset), speed) + start("Target", lane_position(-2, 100), 10)
+    imported = read_openscenario(write(tmp_path, document(starts, event("it", action, condition))))
+    assert doubt in imported.doubts
+
+
+def test_the_length_of_the_ego_s_lane_is_that_of_the_road(tmp_path: Path) -> None:
+    starts = start("Ego", lane_position(-1, 20), 40) + start("Target", lane_position(-2, 100), 10)
+    report = read_openscenario_set(write(tmp_path, document(starts))).report
+    (place,) = report.notes["the ego has no route: it follows its lane"]
+    assert float(place.removesuffix(" m")) == pytest.approx(ROAD_LENGTH - 20, abs=2.0)
 
 
 def test_long_chains_of_waiting_events_are_refused(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -100,6 +99,8 @@ def import_map(
     A page with this report and a picture from above is written too.
     """
     paths.check_exists(file)
+    from rich.console import Console
+
     from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
@@ -110,16 +111,19 @@ def import_map(
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
     report = ImportReport(str(file))
-    path = bake(
-        file,
-        town_name,
-        home_folder(),
-        report=report,
-        strict=strict,
-        turn_on_red=turn_on_red,
-        progress=lambda stage: print(f"{stage} ...", file=sys.stderr),
-        lanelet2=_lanelet2_options(origin, projection, left_hand),
-    )
+    lanelet2 = _lanelet2_options(origin, projection, left_hand)
+    # The line of progress stands on terminals alone, so that an error is the only line of a log.
+    with Console(stderr=True).status(f"reading {file.name}") as status:
+        path = bake(
+            file,
+            town_name,
+            home_folder(),
+            report=report,
+            strict=strict,
+            turn_on_red=turn_on_red,
+            progress=status.update,
+            lanelet2=lanelet2,
+        )
     print(report.text(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}"))
     print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 

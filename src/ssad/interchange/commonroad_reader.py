@@ -122,7 +122,7 @@ class _Reader:
             type="Custom",
             town=town_name,
             route=route,
-            parameters=start_parameters(ego_route, start, speed, digits=6),
+            parameters=start_parameters(ego_route, start, speed, digits=6, report=self.report),
             limits=limits,
             target_speed=target_speed,
             group=self.own_values.get("group", ""),

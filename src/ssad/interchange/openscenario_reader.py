@@ -23,7 +23,18 @@ import numpy as np
 from ssad.core.errors import FormatError, RouteError, SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F64, Actor, EpisodeLimits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
+from ssad.core.types import (
+    F64,
+    Actor,
+    EpisodeLimits,
+    LateralPhase,
+    Phase,
+    Pose,
+    Route,
+    Scenario,
+    SignalPlan,
+    SignalState,
+)
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_distributions import parameter_sets, scenario_file
 from ssad.interchange.openscenario_document import AttributeReader, ConstraintError, read_document, resolve
@@ -31,6 +42,7 @@ from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_maps import DocumentMap, find_map
 from ssad.interchange.openscenario_places import PositionReader
 from ssad.interchange.openscenario_storyboard import StoryboardReader
+from ssad.interchange.openscenario_triggers import earliest_time
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path, move_pose
@@ -279,7 +291,7 @@ class _Reader:
             type="Custom",
             town=self.town,
             route=key_points,
-            parameters=start_parameters(ego_route, start_pose, self.ego.speed, digits=6),
+            parameters=start_parameters(ego_route, start_pose, self.ego.speed, digits=6, report=self.report),
             limits=limits,
             target_speed=min(speed, MAX_SPEED),
             group=self.own_properties.get("group", ""),
@@ -290,6 +302,7 @@ class _Reader:
         )
         for entity in self.entities.values():
             entity.phases = self._with_meetings(entity, ego_route)
+            self._name_late_phases(entity, min(limits.max_steps * STEP, limits.max_time))
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
         try:
             build_episode(scenario, self.graph, seed=0)
@@ -300,6 +313,17 @@ class _Reader:
         for message, times in self.doubts.items():
             self.report.doubt(message, count=times)
         return scenario
+
+    def _name_late_phases(self, entity: Entity, end_time: float) -> None:
+        """Add a doubt for each phase of an actor that begins after the end of the episode."""
+        phases: list[Phase | LateralPhase] = [*entity.phases, *entity.lateral]
+        for phase in phases:
+            begin_time = earliest_time(phase.when)
+            if begin_time > end_time and not entity.ego:
+                event = f"event '{phase.name}'" if phase.name else "an event"
+                self.doubts[
+                    f"{event} of '{entity.name}' waits for {begin_time:g} s; the episode ends at {end_time:g} s"
+                ] += 1
 
     def _centre(self, entity: Entity, pose: Pose) -> Pose:
         return move_pose(pose, *entity.centre) if any(entity.centre) else pose
@@ -387,10 +411,11 @@ class _Reader:
         if points:
             return (start, *points)
         way = self._way(max(self.ego.speed, self.ego.target_speed), limits)
-        self.report.note("the ego has no route: it follows its lane", f"{way:.0f} m")
         path = lane_path(self.graph, start_lane, way)
         if len(path) < 3:
             raise RouteError(f"{self.values.location}: the road ends before the ego '{self.ego.name}'")
+        length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+        self.report.note("the ego has no route: it follows its lane", f"{length:.0f} m")
         count = max(9, int(len(path) * 9 / WAY))
         indices = np.unique(np.linspace(0, len(path) - 2, count).astype(int))
         key_points = path[indices]

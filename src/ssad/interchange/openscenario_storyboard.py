@@ -571,6 +571,7 @@ class StoryboardReader:
             return phase if phase.continuous else replace(phase, shape="step")
         shape, dimension, value = self._dynamics(dynamics)
         if dimension == "rate" and value == 0.0 and shape != "step":
+            self.triggers.doubt(dynamics, f"the speed of '{entity.name}' stays as it is: its rate is 0")
             return None
         is_full = dimension == "rate" and shape == "linear" and value in entity.limits
         if phase.continuous or is_full:
@@ -589,7 +590,12 @@ class StoryboardReader:
             raise self.values.error(element, f"dynamicsShape is '{shape[:40]}'; known: {', '.join(_SHAPES)}")
         if dimension not in ("rate", "time", "distance"):
             raise self.values.error(element, f"dynamicsDimension is '{dimension[:40]}'; known: rate, time, distance")
-        return shape, dimension, abs(self.values.number(element, "value", 0.0))
+        value = self.values.number(element, "value", 0.0)
+        if shape != "step" and element.get("dynamicsDimension") is None:
+            self.triggers.doubt(element, "dynamicsDimension is missing: taken as time")
+        if dimension != "rate" and value < 0.0:  # a negative rate is a usual way to write a deceleration
+            raise self.values.error(element, f"value is {value:g}; a {dimension} is not negative")
+        return shape, dimension, abs(value)
 
     def _profile(self, entity: Entity, action: Element) -> list[Phase]:
         """Return the phases of a SpeedProfileAction: one to each entry."""

@@ -23,6 +23,7 @@ EQUAL: Final = 0.05  # on either side of a value that a quantity is to be equal 
 ALWAYS: Final = PhaseTrigger()
 _ABOVE: Final = ("greaterThan", "greaterOrEqual")
 _BELOW: Final = ("lessThan", "lessOrEqual")
+_RULES: Final = (*_ABOVE, *_BELOW, "equalTo", "notEqualTo")
 _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCondition")
 _LASTING: Final = ("always", "time", "after", "travelled", "phase_start", "phase_end")
 _RISING_KINDS: Final = ("time", "travelled", "speed", "relative_speed", "acceleration", "ego_speed")
@@ -47,6 +48,15 @@ def is_lasting(trigger: PhaseTrigger) -> bool:
         and trigger.edge == "none"
         and all(is_lasting(trigger_part) for trigger_part in (*trigger.all, *trigger.any))
     )
+
+
+def earliest_time(trigger: PhaseTrigger) -> float:
+    """Return the time before which a trigger cannot hold, as far as its conditions on time say, s."""
+    begin_time = trigger.value + trigger.delay if trigger.kind == "time" and trigger.rule != "below" else 0.0
+    begin_time = max([begin_time, *(earliest_time(trigger_part) for trigger_part in trigger.all)])
+    if trigger.any:
+        begin_time = max(begin_time, min(earliest_time(trigger_part) for trigger_part in trigger.any))
+    return begin_time
 
 
 def both(first: Trigger, second: Trigger) -> Trigger:
@@ -216,11 +226,14 @@ class TriggerReader:
 
     def never(self, element: Element, label: str, reason: str) -> Unfulfilled:
         """Report that a trigger can never hold, once for each place."""
+        self.doubt(element, f"the trigger of '{label}' can never fire: {reason}")
+        return Unfulfilled.NEVER
+
+    def doubt(self, element: Element, message: str) -> None:
+        """Report a doubt about an element with its place, once for each place."""
         place = f"{getattr(element, 'source', '')}:{getattr(element, 'line', 0)}"
-        message = f"the trigger of '{label}' can never fire: {reason}"
         if place not in self.report.doubts.get(message, ()):
             self.report.doubt(message, place)
-        return Unfulfilled.NEVER
 
     # ------------------------------------------------------------ conditions on values
 
@@ -232,6 +245,8 @@ class TriggerReader:
                 if value <= 0.0:
                     return self.never(content, label, f"the time is never below {value:g} s")
                 return PhaseTrigger("time", value, rule="below")
+            if rule == "notEqualTo":
+                return Unfulfilled.UNKNOWN
             return PhaseTrigger("time", value) if value > 0.0 else ALWAYS
         if content.tag == "ParameterCondition":
             name = self.values.text(content, "parameterRef").removeprefix("$")
@@ -266,6 +281,10 @@ class TriggerReader:
         trigger_parts = [self._of_entity(content, agent, entity, label) for agent in triggering]
         element = condition.find(".//TriggeringEntities")
         rule = "any" if element is None else self.values.text(element, "triggeringEntitiesRule", "any")
+        if rule not in ("any", "all", "none"):
+            raise self.values.error(condition, f"triggeringEntitiesRule is '{rule[:40]}'; known: any, all, none")
+        if rule == "none":
+            return Unfulfilled.UNKNOWN
         return all_of(trigger_parts) if rule == "all" else any_of(trigger_parts)
 
     def _of_entity(self, content: Element, agent: Entity, entity: Entity | None, label: str) -> Trigger:
@@ -335,7 +354,10 @@ class TriggerReader:
 
     def _rule(self, content: Element) -> str:
         rule = self.values.text(content, "rule", "")
-        return _OLD_RULES.get(rule, rule)
+        rule = _OLD_RULES.get(rule, rule)
+        if rule and rule not in _RULES:
+            raise self.values.error(content, f"rule is '{rule[:40]}'; known: {', '.join(_RULES)}")
+        return rule
 
     def _measured(self, trigger: PhaseTrigger, content: Element) -> PhaseTrigger:
         """Return a trigger on a distance with the way in which a condition measures it."""

@@ -91,3 +91,30 @@ def test_a_driver_drives_alike_in_any_batch() -> None:
         alone.step()
     assert batch.hashes()[0] == alone.hashes()[0]
     assert batch.hashes()[0] != batch.hashes()[2]
+
+
+def crossing(start: float) -> Episode:
+    """A car at 15 m/s along x with priority, and one from the side that starts from rest `start` m before it."""
+    side = replace(
+        line_route(0.0, 200.0),
+        xy=np.stack([np.full(201, 150.0), np.arange(201.0) - 100.0], 1).astype(np.float32),
+        yaw=np.full(201, 0.5 * np.pi, np.float32),
+    )
+    fast = EpisodeAgent("fast", "car", Controller.AUTOPILOT, Pose(20.0, 0.0, 0.0), 15.0, 15.0, driver=CALM)
+    slow = EpisodeAgent(
+        "slow", "car", Controller.AUTOPILOT, Pose(150.0, -start, 0.5 * np.pi), 6.0, 8.0, driver=CALM, route=side
+    )
+    return episode(ego(2.0), replace(fast, route=line_route(20.0, 390.0)), slow)
+
+
+def test_who_gives_way_leaves_a_margin_and_stops_beside_the_corridor() -> None:
+    world = World([crossing(start) for start in np.arange(54.0, 64.0, 2.0).tolist()], NO_PASSING)
+    braking, gap = np.zeros(world.batch), np.full(world.batch, np.inf)
+    for _ in range(110):
+        world.step()
+        pose = world.array("pose")
+        braking = np.maximum(braking, -world.array("accel")[:, 1])
+        inside = np.abs(pose[:, 2, 1]) < HALF + 1.0
+        gap = np.where(inside, np.minimum(gap, np.abs(pose[:, 1, 0] - 150.0)), gap)
+    assert braking.max() < 1.0
+    assert gap.min() > 9.0

@@ -11,6 +11,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.world.roads import LaneGraph, load_graph, load_town
 
 BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
+TRACKS = ("HighSpeedTrack",)  # without junctions
 IMPORTED = ("Town_Safebench_Light", "Town02", "Town05")
 
 

@@ -27,6 +27,8 @@ from ssad.world.kernels.data import (
 )
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
+    CREEPS,
+    FIRM,
     RUNS_RED,
     STOPS_AT_YELLOW,
     YIELD_LEAST,
@@ -66,10 +68,11 @@ APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at c
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
 MARGIN = wp.constant(2)  # strides between a driver that gives way and who comes after it
-MOST_MARGIN = wp.constant(6)  # strides of it at most, with what the other may gain
+MOST_MARGIN = wp.constant(12)  # strides of it at most, with what the other may gain
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
-INSIDE = wp.constant(5.0)  # m beyond its line in which a driver still stops for somebody in the junction
+INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
 STILL_STOPS = wp.constant(5.0)  # m/s^2 of who brakes for the conflict already
+TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
 BRAKES = wp.constant(1.0)  # m/s^2
 COMMITTED = wp.constant(3.0)  # m/s^2: who would have to brake harder before a conflict goes on
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -262,6 +265,9 @@ def is_clearing(
     line = perceived.way[b, j][0] - perceived.half[b, j][0]
     speed = perceived.speed[b, j]
     too_late = bool(False)
+    if j < bank.style.shape[1]:
+        if bank.style[e, j][0] > 0.0 and perceived.way[b, j][0] > perceived.way[b, j][1] - 0.5:
+            index = int(-1)  # its line is behind: the next signal is that of another junction
     if index >= 0 and speed * speed >= 8.0 * (wp.max(line, 0.0) + 1.5):
         signal_now = light(bank, roads, state, perceived, b, me, e, index, dt)
         too_late = signal_now == SignalState.YELLOW or signal_now == SignalState.RED
@@ -334,7 +340,10 @@ def looks_longer(rule: wp.vec4, offset: float, half: float, speed: float, style:
     front = rule[2] - offset - half
     crosses = int(rule[3]) != int(TurnRank.STRAIGHT) or speed < 3.0
     extra = int(0)
-    if style[0] > 0.0 and rule[2] > 0.0 and front < APPROACH and crosses:
+    reach = float(APPROACH)
+    if int(rule[3]) >= int(TurnRank.YIELD):
+        reach = 2.0 * APPROACH
+    if style[0] > 0.0 and rule[2] > 0.0 and front < reach and crosses:
         extra = LONGER
     return extra
 
@@ -840,15 +849,26 @@ def react_to_agents(
             goes_first = bool(False)
             margin_strides = int(0)
             other_accel = float(0.0)
+            merges = bool(False)
+            waits = bool(False)
             if style[0] > 0.0:
                 pick_up = 0.8 * style[2]
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first)
                 crosses = wp.abs(wp.sin(other_pose[2] - pose[2])) > 0.5 or wp.cos(other_pose[2] - pose[2]) < -0.5
+                turn = other_pose[2] - pose[2]
+                aside = wp.abs(
+                    (other_pose[1] - pose[1]) * wp.cos(pose[2]) - (other_pose[0] - pose[0]) * wp.sin(pose[2])
+                )
+                merges = wp.cos(turn) > 0.8 and aside > 1.5 and not walks
                 if not goes_first and not walks and crosses:
                     margin_strides = MARGIN
                     if j < agents:
                         other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
+                if j < agents:
+                    waits = (perceived.speed[b, j] < CREEPS and state.accel[b, j] < -0.1) or (
+                        perceived.speed[b, j] < TURNS and state.accel[b, j] < -BRAKES
+                    )
             conflict = conflict_gap(
                 roads,
                 perceived,
@@ -903,7 +923,17 @@ def react_to_agents(
                         else:
                             gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS):
+                if merges:
+                    # where two lanes become one, the driver behind makes room
+                    cosine = wp.cos(pose[2])
+                    sine = wp.sin(pose[2])
+                    ahead = (other_pose[0] - pose[0]) * cosine + (other_pose[1] - pose[1]) * sine
+                    if ahead > 0.0 or (ahead == 0.0 and not goes_first):
+                        room = wp.max(ahead - own_body[0] - other_half[0], 1.0)
+                        react = wp.min(
+                            react, wp.max(follow(speed, perceived.speed[b, j], room, style), -FIRM - style[2])
+                        )
+                elif not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS and not waits):
                     if at_line and style[0] > 0.0:
                         react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
                     elif style[0] > 0.0:
