@@ -23,7 +23,18 @@ import numpy as np
 from ssad.core.errors import FormatError, RouteError, SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F64, Actor, EpisodeLimits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
+from ssad.core.types import (
+    F64,
+    Actor,
+    EpisodeLimits,
+    LateralPhase,
+    Phase,
+    Pose,
+    Route,
+    Scenario,
+    SignalPlan,
+    SignalState,
+)
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_distributions import parameter_sets, scenario_file
 from ssad.interchange.openscenario_document import AttributeReader, ConstraintError, read_document, resolve
@@ -305,7 +316,8 @@ class _Reader:
 
     def _name_late_phases(self, entity: Entity, end_time: float) -> None:
         """Add a doubt for each phase of an actor that begins after the end of the episode."""
-        for phase in (*entity.phases, *entity.lateral):
+        phases: list[Phase | LateralPhase] = [*entity.phases, *entity.lateral]
+        for phase in phases:
             begin_time = earliest_time(phase.when)
             if begin_time > end_time and not entity.ego:
                 event = f"event '{phase.name}'" if phase.name else "an event"
