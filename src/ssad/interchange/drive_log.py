@@ -129,7 +129,8 @@ def scenario_of_drive(
         raise ConfigError(f"{location}: nothing is annotated that could be an actor; choose another scene")
     tracks = _nearest_tracks(tracks, ego_poses, account)
     graph, is_known = _town(scene_data, location, path_length, tracks, town=town, map_name=map_name)
-    scenario = _scenario(scene_data, graph, path_length, tracks, name or f"log/{scene_data.record.name}", data.version)
+    scenario_name = name or f"log/{scene_data.record.name}"
+    scenario = _scenario(scene_data, graph, path_length, tracks, scenario_name, data.version, account)
     build_episode(scenario, graph, seed=0)
     account.contents += [
         f"nuScenes schema {data.version}, scene {scene_data.record.name}: {len(scene_data.samples)} key frames",
@@ -271,7 +272,13 @@ def _max_speed(rows: F64) -> float:
 
 
 def _scenario(  # noqa: PLR0917
-    scene: SceneData, graph: LaneGraph, path: F64, tracks: Sequence[_Track], name: str, version: str
+    scene: SceneData,
+    graph: LaneGraph,
+    path: F64,
+    tracks: Sequence[_Track],
+    name: str,
+    version: str,
+    report: ImportReport,
 ) -> Scenario:
     """The ego's route and start, the actors, and limits with time to spare."""
     points = _key_points(path)
@@ -290,7 +297,7 @@ def _scenario(  # noqa: PLR0917
     start_pose = points[0]
     early_row = path[np.searchsorted(path[:, 0], min(0.5, float(path[-1, 0])))]
     speed = math.hypot(early_row[1] - start_pose.x, early_row[2] - start_pose.y) / max(float(early_row[0]), STEP)
-    parameters = start_parameters(route, start_pose, speed, digits=3)
+    parameters = start_parameters(route, start_pose, speed, digits=3, report=report)
     parameters.pop("ego_longitudinal", None)  # the route begins where the ego does
     seconds = 1e-6 * (scene.samples[-1].timestamp - scene.samples[0].timestamp)
     steps = math.ceil(2 * seconds / STEP) + 100

@@ -270,7 +270,7 @@ def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int, report: 
         type="Custom",
         town=program.town,
         route=key_points,
-        parameters=start_parameters(ego_route, start_pose, max(speed, 0.0), digits=6),
+        parameters=start_parameters(ego_route, start_pose, max(speed, 0.0), digits=6, report=report),
         actors=tuple(_actor(drive, rows, index, end_time) for index in range(1, rows.shape[1])),
         limits=EpisodeLimits(max_steps=len(rows) + 100),
         target_speed=round(top_speed, 2) if top_speed >= 1.0 else 8.0,
