@@ -312,6 +312,27 @@ def test_the_length_of_the_ego_s_lane_is_that_of_the_road(tmp_path: Path) -> Non
     assert float(place.removesuffix(" m")) == pytest.approx(ROAD_LENGTH - 20, abs=2.0)
 
 
+@pytest.mark.parametrize("along", [20.0, 90.0, 250.0])
+def test_the_ego_starts_where_the_file_says_on_a_route_that_begins_earlier(along: float, tmp_path: Path) -> None:
+    waypoints = "".join(
+        f'<Waypoint routeStrategy="shortest">{lane_position(-1, s)}</Waypoint>' for s in (20, 100, 200, 300)
+    )
+    route = (
+        '<Private entityRef="Ego"><PrivateAction><RoutingAction><AssignRouteAction><Route name="way" closed="false">'
+        f"{waypoints}</Route></AssignRouteAction></RoutingAction></PrivateAction></Private>"
+    )
+    starts = start("Ego", lane_position(-1, along), 15) + start("Target", lane_position(-2, 100), 10)
+    imported = read_openscenario(write(tmp_path, document(starts + route)))
+    town = load_town(imported.scenario.town)
+    ego = build_episode(imported.scenario, town, seed=0).agents[0]
+    stated = read_openscenario(write(tmp_path, document(starts))).scenario
+    without_route = build_episode(stated, town, seed=0).agents[0]
+    assert (ego.pose.x, ego.pose.y) == pytest.approx((without_route.pose.x, without_route.pose.y), abs=1e-3)
+    assert ego.route is not None
+    assert ego.route.length == pytest.approx(300 - along, abs=11.0)
+    assert not imported.doubts
+
+
 def test_long_chains_of_waiting_events_are_refused(tmp_path: Path) -> None:
     show = '<VisibilityAction graphics="true" traffic="true" sensors="true"/>'
     events = [event("brake", speed_action(3, "linear", "rate", 4), state("0", "event", "completeState"))]

@@ -44,7 +44,7 @@ from ssad.interchange.openscenario_places import PositionReader
 from ssad.interchange.openscenario_storyboard import StoryboardReader
 from ssad.interchange.openscenario_triggers import earliest_time
 from ssad.interchange.scenario_parts import plan_of, scenario_name
-from ssad.scenarios.dynamic import build_episode
+from ssad.scenarios.dynamic import CUSTOM, build_episode, parameter_box
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path, move_pose
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
@@ -58,6 +58,7 @@ WAY: Final = 200.0  # m, shortest path along its lane of an agent without a rout
 LONGEST_WAY: Final = 3000.0  # m
 DEFAULT_TIME: Final = 60.0  # s of a scenario that states no time
 FAR_OFF: Final = 5.0  # m from the ego's route of a point that it does not pass
+MAX_EGO_LONGITUDINAL: Final = parameter_box(CUSTOM)["ego_longitudinal"].high  # m
 
 
 @dataclass(frozen=True)
@@ -406,7 +407,7 @@ class _Reader:
             begins_here = math.dist((first.x, first.y), (start.x, start.y)) < FAR_OFF
             points = self._along_trajectory(trajectory if begins_here else (start, *trajectory))
         if len(points) > 1:
-            return points
+            return self._from_start(points, start)
         start_lane = self._start_lane(start)
         if points:
             return (start, *points)
@@ -423,6 +424,18 @@ class _Reader:
         return tuple(
             Pose(x, y, heading) for (x, y), heading in zip(key_points.tolist(), headings.tolist(), strict=True)
         )
+
+    def _from_start(self, points: tuple[Pose, ...], start: Pose) -> tuple[Pose, ...]:
+        """Return the key points of a route from where it passes the ego's start, which may lie far along it."""
+        route = route_along(self.graph, points)
+        distance = np.hypot(route.xy[:, 0] - start.x, route.xy[:, 1] - start.y)
+        first = int(np.argmin(distance))
+        if first * route.spacing <= MAX_EGO_LONGITUDINAL or distance[first] > FAR_OFF:
+            return points
+        nearest = [int(np.argmin(np.hypot(*(route.xy - (point.x, point.y)).T))) for point in points]
+        later = [point for point, index in zip(points, nearest, strict=True) if index > first + 1]
+        x, y = route.xy[first].tolist()
+        return (Pose(x, y, float(route.yaw[first])), *(later or points[-1:]))
 
     def _along_trajectory(self, path: tuple[Pose, ...]) -> tuple[Pose, ...]:
         """Return key points of a route along the trajectory of the ego; () if the lanes do not allow it."""
