@@ -312,6 +312,18 @@ def test_the_length_of_the_ego_s_lane_is_that_of_the_road(tmp_path: Path) -> Non
     assert float(place.removesuffix(" m")) == pytest.approx(ROAD_LENGTH - 20, abs=2.0)
 
 
+@pytest.mark.parametrize("others", [0, 1])
+def test_an_event_may_wait_for_the_start_of_its_own_act(others: int, tmp_path: Path) -> None:
+    brake = event("brake", speed_action(3, "linear", "rate", 4), state("act", "act", "startTransition"))
+    change = event("change", lane_change(0, "sinusoidal", "time", 3), state("brake", "event", "completeState"))
+    starts = start("Ego", lane_position(-1, 20), 15) + start("Target", lane_position(-2, 100), 10)
+    imported = read_openscenario(write(tmp_path, document(starts, brake + others * change)))
+    (phase,) = imported.scenario.actors[0].phases
+    assert (phase.name, phase.when.kind) in {("brake", "always"), ("brake", "time")}
+    assert len(imported.scenario.actors[0].lateral) == others
+    assert not imported.doubts
+
+
 @pytest.mark.parametrize("along", [20.0, 90.0, 250.0])
 def test_the_ego_starts_where_the_file_says_on_a_route_that_begins_earlier(along: float, tmp_path: Path) -> None:
     waypoints = "".join(

@@ -339,10 +339,14 @@ class StoryboardReader:
         events = [part for part in story_element.every() if part.element.tag == "Event"]
         if story_element.element.tag == "Action" and story_element.parent is not None:
             events = [story_element.parent]
-        begins = [self._takes_place(event, content, label) for event in events]
+        is_start = state in ("startTransition", "runningState")
+        if is_start and story_element.element.tag in ("Story", "Act"):
+            return self._begun(story_element, content, label)  # acts start whether or not their events do
+        # The event that waits is left out: whether it takes place is what is asked.
+        begins = [self._takes_place(event, content, label) for event in events if id(event) not in self._open]
         if begins and not any(isinstance(trigger, PhaseTrigger) for trigger in begins):
             return begins[0]
-        if state in ("startTransition", "runningState"):
+        if is_start:
             return self._begun(story_element, content, label)
         if state in ("endTransition", "completeState", "stopTransition", "skipTransition"):
             return self._ended(story_element, content, label)
