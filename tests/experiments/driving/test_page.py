@@ -201,6 +201,26 @@ def test_embedded_replay_gives_back_the_trace(run_folder: Path) -> None:
         assert len(episode["hits"]) == np.count_nonzero(trace.contact)
 
 
+@pytest.mark.parametrize(("offset", "stretch"), [(0.0, 1.0), (1500.0, 1.0), (-4000.0, 1.0), (0.0, 40.0)])
+def test_a_replay_far_from_the_origin_or_of_a_long_way_gives_back_the_trace(
+    run_folder: Path, offset: float, stretch: float
+) -> None:
+    trace = load_trace(next((run_folder / "traces").glob("*.npz")))
+    graph = load_town(trace.town)
+    shifted = replace(
+        trace,
+        x=trace.x * np.float32(stretch) + np.float32(offset),
+        route=trace.route * np.float32([stretch, 1.0]) + np.float32([offset, 0.0]),
+    )
+    episode = episode_data(shifted, graph)
+    agents, scale = len(trace.names), episode["scale"]
+    assert scale == pytest.approx(SCALE) if stretch == 1.0 else SCALE < scale < 0.5
+    columns = unpack(episode["motion"], 3 * agents + -(-agents // 15))
+    x = columns[: 3 * agents : 3] * scale + origin(graph)[0] + episode["anchor"][0]
+    here = trace.active.T
+    np.testing.assert_allclose(x[here], shifted.x.T[here], atol=scale)
+
+
 def test_pack_survives_wrap_around() -> None:
     columns = np.array([[32767, -32767, 0, 12], [-5, -5, 7, 32767]], np.int16)
     np.testing.assert_array_equal(unpack(encode_int16(columns), 2), columns)

@@ -1,7 +1,8 @@
 """Replays as compact data inside the page: quantised, differenced, deflated, base64.
 
-Coordinates are int16 in units of `SCALE` m from the town's origin, angles int16 in units of pi / 32767. A block holds
-its columns one after the other, each as differences along time (with int16 wrap-around, so nothing is lost).
+Coordinates are int16 in units of `SCALE` m from the town's origin, angles int16 in units of pi / 32767. An episode too
+far out for that has an anchor of its own, and coarser units where it is too long. A block holds its columns one after
+the other, each as differences along time (with int16 wrap-around, so nothing is lost).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips, simp
 from ssad.core.types import EpisodeTrace, LaneType
 
 SCALE = 0.03  # m
+LARGEST = 32767  # units of a coordinate
 SPEED = 0.01  # m/s
 SHARE = 1000.0  # throttle, brake, steer, completion as thousandths
 NEAR = 80.0  # m around the episodes in which lanes are kept
@@ -32,13 +34,24 @@ def encode_int16(columns: npt.NDArray[np.int16]) -> str:
 
 
 def _to_int16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
-    return np.clip(np.round(values), -32767, 32767).astype(np.int16)
+    return np.clip(np.round(values), -LARGEST, LARGEST).astype(np.int16)
 
 
 def origin(graph: LaneGraph) -> tuple[float, float]:
     """Return the centre of the town's extent, m: the origin of all coordinates."""
     centre = 0.5 * (graph.xy.min(axis=0).astype(np.float64) + graph.xy.max(axis=0))
     return float(np.round(centre[0], 1)), float(np.round(centre[1], 1))
+
+
+def _anchor_and_scale(trace: EpisodeTrace, town_origin: tuple[float, float]) -> tuple[tuple[float, float], float]:
+    """Return the point that coordinates of an episode count from, m from the town's origin, and their unit, m."""
+    positions = np.stack([trace.x[trace.active], trace.y[trace.active]], axis=1)
+    points = np.concatenate([positions, trace.route]).astype(np.float64) - town_origin
+    low, high = points.min(axis=0), points.max(axis=0)
+    if max(-low.min(), high.max()) <= LARGEST * SCALE:
+        return (0.0, 0.0), SCALE
+    anchor_x, anchor_y = np.round(0.5 * (low + high), 1).tolist()
+    return (anchor_x, anchor_y), max(SCALE, float((high - low).max() / 2 + 1.0) / LARGEST)
 
 
 def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
@@ -49,15 +62,17 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         graph: Its town.
 
     Returns:
-        The agents' bodies; the packed motion: [3 A + 1 rows of T] x, y, yaw per agent, then presence (bits of 15 agents
-        a row); the packed record of the ego; its route; and the events.
+        The agents' bodies; the anchor and the unit of coordinates; the packed motion: [3 A + 1 rows of T] x, y, yaw per
+        agent, then presence (bits of 15 agents a row); the packed record of the ego; its route; and the events.
     """
-    origin_x, origin_y = origin(graph)
+    town_origin = origin(graph)
+    anchor, scale = _anchor_and_scale(trace, town_origin)
+    origin_x, origin_y = town_origin[0] + anchor[0], town_origin[1] + anchor[1]
     agent_count = len(trace.names)
     rows = []
     for agent in range(agent_count):
-        rows += [(trace.x[:, agent] - origin_x) / SCALE, (trace.y[:, agent] - origin_y) / SCALE]
-        rows.append(np.arctan2(np.sin(trace.yaw[:, agent]), np.cos(trace.yaw[:, agent])) / np.pi * 32767)
+        rows += [(trace.x[:, agent] - origin_x) / scale, (trace.y[:, agent] - origin_y) / scale]
+        rows.append(np.arctan2(np.sin(trace.yaw[:, agent]), np.cos(trace.yaw[:, agent])) / np.pi * LARGEST)
     # presence as bits of 15 agents a row
     presence = []
     for first_agent in range(0, agent_count, 15):
@@ -79,10 +94,12 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         "names": list(trace.names),
         "kinds": trace.kind.tolist(),
         "size": np.round(np.stack([trace.length, trace.width], 1), 2).tolist(),
+        "anchor": list(anchor),
+        "scale": scale,
         "motion": encode_int16(np.stack([_to_int16(np.asarray(row)) for row in [*rows, *presence]])),
         "record": encode_int16(np.stack([_to_int16(row) for row in record])),
         "route": encode_int16(
-            _to_int16((simplify_polyline(trace.route.astype(np.float64)) - [origin_x, origin_y]) / SCALE).T
+            _to_int16((simplify_polyline(trace.route.astype(np.float64)) - [origin_x, origin_y]) / scale).T
         ),
         "hits": contacts,
         "red": np.flatnonzero(trace.red_light).tolist(),

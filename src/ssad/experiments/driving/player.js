@@ -76,11 +76,11 @@ async function show(key) {
 const angle = (v) => v / 32767 * Math.PI;
 function pose(a, t) {
   const i = Math.min(Math.floor(t), now.steps - 1), j = Math.min(i + 1, now.steps - 1), f = t - i;
-  const c = now.columns, mix = (r) => (c[r][i] + (c[r][j] - c[r][i]) * f) * data.scale;
+  const c = now.columns, mix = (r) => (c[r][i] + (c[r][j] - c[r][i]) * f) * now.scale;
   const y0 = angle(c[3 * a + 2][i]);
   let turn = angle(c[3 * a + 2][j]) - y0;
   turn -= 2 * Math.PI * Math.round(turn / (2 * Math.PI));
-  return [mix(3 * a), mix(3 * a + 1), y0 + turn * f];
+  return [mix(3 * a) + now.anchor[0], mix(3 * a + 1) + now.anchor[1], y0 + turn * f];
 }
 const present = (a, i) => now.columns[3 * now.names.length + Math.floor(a / 15)][i] >> (a % 15) & 1;
 
@@ -134,7 +134,7 @@ function draw() {
   }
   pen.setLineDash([]);
   pen.strokeStyle = css("--s0"); pen.globalAlpha = 0.35; pen.lineWidth = 1.1; pen.lineJoin = "round"; pen.beginPath();
-  now.path[0].forEach((x, k) => { const p = [x * data.scale, now.path[1][k] * data.scale]; k ? pen.lineTo(...p) : pen.moveTo(...p); });
+  now.path[0].forEach((x, k) => { const p = [x * now.scale + now.anchor[0], now.path[1][k] * now.scale + now.anchor[1]]; k ? pen.lineTo(...p) : pen.moveTo(...p); });
   pen.stroke(); pen.globalAlpha = 1;
   for (let a = 0; a < now.names.length; a++) trail(a, i);
   for (const [index, changes] of now.signals) {
@@ -205,7 +205,7 @@ function toggle() {
 function jump(step) { if (now) { playing = false; time = Math.min(Math.max(step, 0), now.steps - 1); button(); draw(); } }
 function fit() {
   if (!now) return;
-  const xs = Array.from(now.path[0], (v) => v * data.scale), ys = Array.from(now.path[1], (v) => v * data.scale);
+  const xs = Array.from(now.path[0], (v) => v * now.scale + now.anchor[0]), ys = Array.from(now.path[1], (v) => v * now.scale + now.anchor[1]);
   const low = [Math.min(...xs), Math.min(...ys)], high = [Math.max(...xs), Math.max(...ys)];
   view = { x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2,
     scale: Math.min(canvas.clientWidth / (high[0] - low[0] + 40), canvas.clientHeight / (high[1] - low[1] + 40)) };

@@ -10,7 +10,7 @@ from ssad.core.folders import path_inside
 from ssad.core.lane_graph import LaneGraph, load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.core.types import EpisodeTrace
-from ssad.experiments.driving.embed import SCALE, SHARE, SPEED, episode_data, town_data
+from ssad.experiments.driving.embed import SHARE, SPEED, episode_data, town_data
 from ssad.experiments.driving.episodes import DrivingRun, EpisodeRecord
 from ssad.report.paper import SCENARIOS
 
@@ -76,7 +76,6 @@ def replay_data(run: DrivingRun) -> dict[str, Any]:
         for name, graph in graphs.items()
     }
     return {
-        "scale": SCALE,
         "speed": SPEED,
         "share": SHARE,
         "towns": towns,
