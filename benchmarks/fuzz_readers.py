@@ -98,7 +98,7 @@ class Reader:
 
     @property
     def is_available(self) -> bool:
-        """Whether its package is installed."""
+        """Return whether its package is installed."""
         return not self.package or importlib.util.find_spec(self.package) is not None
 
 

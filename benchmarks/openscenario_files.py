@@ -56,7 +56,7 @@ class Result:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all that moves actors is carried over."""
+        """Return whether all that moves actors is carried over."""
         return not self.error and all(STANDING.search(reason) for reason in self.doubts)
 
 

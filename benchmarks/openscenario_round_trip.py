@@ -203,11 +203,11 @@ def main() -> None:
             issues.append(findings(path, folder))
             print(f"{before.name}: {distances[-1]:.6f} m, issues {issues[-1]}")
     checked = [count for count in issues if count is not None]
-    found = f"{sum(checked)} in {len(checked)} files" if checked else "not checked"
+    findings_text = f"{sum(checked)} in {len(checked)} files" if checked else "not checked"
     lines = [
         "| scenarios | within 1 cm | farthest, m | issues that ASAM's checker finds |",
         "|---:|---:|---:|---:|",
-        f"| {COUNT} | {sum(distance < CLOSE for distance in distances)} | {max(distances):.4f} | {found} |",
+        f"| {COUNT} | {sum(distance < CLOSE for distance in distances)} | {max(distances):.4f} | {findings_text} |",
     ]
     print("\n".join(lines))
     if arguments.page:

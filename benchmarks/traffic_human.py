@@ -66,7 +66,7 @@ BESIDE = {
 
 @dataclass
 class Record:
-    """What `record` keeps of a drive: arrays [T, N] over the steps that count and the vehicles of all scenes."""
+    """Recorded values of a drive: arrays [T, N] over the steps that count and the vehicles of all scenes."""
 
     pose: Any
     speed: Any

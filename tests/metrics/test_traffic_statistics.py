@@ -82,7 +82,7 @@ def test_queues_discharge_with_the_headways_of_their_making() -> None:
     since = np.concatenate([moments, moments[::-1], [9.0]])
     group = np.array([0] * 5 + [1] * 5 + [0])
     queued = np.array([True] * 10 + [False])
-    measured = queue_discharge(since, group, queued, least=2)
+    measured = queue_discharge(since, group, queued, min_headways=2)
     # the vehicle that came late ends the first queue, after its third
     np.testing.assert_allclose(measured.headways, [2.0, 2.0])
     np.testing.assert_allclose(measured.first, [3.0, 3.0])

@@ -361,8 +361,10 @@ class _Parser:
         if group == "word" and self.bare_names and text not in RESERVED:
             raise self.error(f"there is no function '{text}'; functions: {', '.join(_FUNCTIONS)}")
         if group == "word" and not self.bare_names:
-            known = ", ".join(_FUNCTIONS)
-            raise self.error(f"'{text}' is no function or constant; functions: {known}; parameters are written $name")
+            function_names = ", ".join(_FUNCTIONS)
+            raise self.error(
+                f"'{text}' is no function or constant; functions: {function_names}; parameters are written $name"
+            )
         raise self.error(f"'{text}' is not expected there")
 
     def call(self, name: str) -> Value:

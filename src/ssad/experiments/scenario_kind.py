@@ -193,8 +193,8 @@ class ScenarioKind(Kind):
         scenario_text = "" if scenario_count == 1 else f" of {scenario_count} scenarios"
         # Grids that several scenarios declare may have different sizes.
         is_complete = DECLARED_GRID not in suite.sweep.values() and total > len(points)
-        left_out = f"; {total - len(points)} more violate a constraint or are not selected" if is_complete else ""
-        return [f"sweep: {len(points)} grid points{scenario_text} ({size_text} values){left_out}"]
+        excluded_text = f"; {total - len(points)} more violate a constraint or are not selected" if is_complete else ""
+        return [f"sweep: {len(points)} grid points{scenario_text} ({size_text} values){excluded_text}"]
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Store copies of the towns beside the results, so that a report can be made where they are not imported."""

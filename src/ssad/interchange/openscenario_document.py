@@ -251,9 +251,9 @@ def resolve(
     declarations = _declarations(root)
     for name in assigned or {}:
         if name not in declarations:
-            known = ", ".join(declarations) or "none"
+            names = ", ".join(declarations) or "none"
             raise FormatError(
-                f"{file_path}: it declares no parameter '{name[:60]}' that could be set; declared: {known}"
+                f"{file_path}: it declares no parameter '{name[:60]}' that could be set; declared: {names}"
             )
     scope = Scope(declarations, assigned or {})
     scope.check()
@@ -332,9 +332,10 @@ class _Catalogues:
         if catalogue is None:
             return None
         if entry_name not in catalogue:
-            known = ", ".join(sorted(catalogue)[:12])
+            entries = ", ".join(sorted(catalogue)[:12])
             raise error_at(
-                reference, f"catalogue '{catalogue_name[:60]}' has no entry '{entry_name[:60]}'; it has: {known[:300]}"
+                reference,
+                f"catalogue '{catalogue_name[:60]}' has no entry '{entry_name[:60]}'; it has: {entries[:300]}",
             )
         return catalogue[entry_name]
 

@@ -223,9 +223,9 @@ class PositionReader:
         s = self._position_along(element, map_road, self.values.number(element, "s"))
         spot = self.roads.lane(map_road, lane_id, s)
         if spot is None:
-            known = ", ".join(map(str, self.roads.lane_ids(map_road, s)))
+            lane_names = ", ".join(map(str, self.roads.lane_ids(map_road, s)))
             name = self.values.text(element, "roadId")
-            raise self.values.error(element, f"road {name} has no lane {lane_id} at s {s:g}; it has {known}")
+            raise self.values.error(element, f"road {name} has no lane {lane_id} at s {s:g}; it has {lane_names}")
         x, y, heading = self.roads.at(map_road, s, spot.t + offset)
         heading_angle = heading if spot.forward else float(wrap_angle(heading + math.pi))
         return self._apply_orientation(element, Pose(x, y, heading_angle))

@@ -456,12 +456,12 @@ class _Reader:
         line = route.xy.astype(np.float64)
         phases = []
         for phase in entity.phases:
-            arrival, kept = phase.arrival, phase
+            arrival, carried_phase = phase.arrival, phase
             is_of_ego = arrival is not None and arrival.reference == "ego"
             if arrival is not None and is_of_ego and _distance(line, arrival.reference_point) > FAR_OFF:
                 self.doubts[f"'{entity.name}' meets the ego at a point that its route does not pass"] += 1
-                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
-            phases.append(kept)
+                carried_phase = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(carried_phase)
         return phases
 
     def _actors(self, limits: EpisodeLimits) -> list[Actor]:
@@ -510,11 +510,11 @@ class _Reader:
         line = np.array(path if len(path) > 1 else ((pose.x, pose.y), (ahead.x, ahead.y)))
         phases = []
         for phase in entity.phases:
-            kept = phase
+            carried_phase = phase
             if phase.arrival is not None and _distance(line, phase.arrival.point) > FAR_OFF:
                 self.doubts[f"'{entity.name}' meets another at a point that its path does not pass"] += 1
-                kept = replace(phase, arrival=None, speed=phase.speed or entity.speed)
-            phases.append(kept)
+                carried_phase = replace(phase, arrival=None, speed=phase.speed or entity.speed)
+            phases.append(carried_phase)
         return tuple(phases)
 
     def _on_trajectory(self, entity: Entity, pose: Pose, until: float) -> Actor:

@@ -288,8 +288,8 @@ class StoryboardReader:
             return None
         own_time = {"always": 0.0, "time": trigger.value + trigger.delay}.get(trigger.kind)
         times = [own_time, *(self._time(part) for part in trigger.all)]
-        known = [time for time in times if time is not None]
-        return max(known) if len(known) == len(times) and trigger.rule != "below" else None
+        stated_times = [time for time in times if time is not None]
+        return max(stated_times) if len(stated_times) == len(times) and trigger.rule != "below" else None
 
     # ------------------------------------------------------------ triggers of elements
 

@@ -84,7 +84,7 @@ class CollisionProof:
 
     @property
     def is_proven(self) -> bool | None:
-        """Whether all conditions hold; None where that depends on a grade that was not made."""
+        """Return whether all conditions hold; None where that depends on a grade that was not made."""
         return self.avoidable if self.is_candidate else False
 
 

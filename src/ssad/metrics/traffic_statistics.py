@@ -124,7 +124,7 @@ class Discharge:
         headways: Saturated headways, s: from the fourth vehicle of a queue on.
         first: Time from the beginning of green until the first vehicle of a queue crosses the line, s.
         lost: Start-up lost time, s: what the first three headways exceed the mean saturated one, summed; NaN with fewer
-            than `least` saturated headways.
+            than `min_headways` saturated headways.
     """
 
     headways: F64
@@ -132,14 +132,14 @@ class Discharge:
     lost: float
 
 
-def queue_discharge(since_green: F64, group: Ints, queued: Bool, *, least: int = 10) -> Discharge:
+def queue_discharge(since_green: F64, group: Ints, queued: Bool, *, min_headways: int = 10) -> Discharge:
     """Measure the discharge of queues from the moments at which vehicles cross stop lines.
 
     Args:
         since_green: [E] s from the beginning of green to each crossing.
         group: [E] number of the queue: one line in one cycle.
         queued: [E] whether the vehicle stood before the line during red. A queue ends before the first that did not.
-        least: Saturated headways without which there is no lost time.
+        min_headways: Saturated headways without which there is no lost time.
 
     Source: Highway Capacity Manual, 7th edition, chapter 31 (field measurement of saturation flow).
     """
@@ -153,7 +153,7 @@ def queue_discharge(since_green: F64, group: Ints, queued: Bool, *, least: int =
         for position, headway in enumerate(np.diff(moments[:length], prepend=0.0).tolist()):
             (early[position] if position < QUEUE_START - 1 else saturated).append(headway)
     lost = math.nan
-    if len(saturated) >= least:
+    if len(saturated) >= min_headways:
         mean = float(np.mean(saturated))
         lost = sum(float(np.mean(values)) - mean for values in early if values)
     return Discharge(np.array(saturated), np.array(early[0]), lost)
@@ -224,11 +224,11 @@ def post_encroachment_times(stays: Visits, time_step: float, *, longest: float =
     other = stays.vehicle[1:] != stays.vehicle[:-1]
     time = np.maximum(stays.first[1:] - stays.last[:-1], 0) * time_step
     rows = np.flatnonzero(next_same & crossing & other & (time <= longest))
-    least: dict[tuple[int, int], float] = {}
+    shortest_times: dict[tuple[int, int], float] = {}
     for stay_row in rows.tolist():
         pair = (int(stays.vehicle[stay_row]), int(stays.vehicle[stay_row + 1]))
-        least[pair] = min(least.get(pair, math.inf), float(time[stay_row]))
-    return np.array(sorted(least.values()))
+        shortest_times[pair] = min(shortest_times.get(pair, math.inf), float(time[stay_row]))
+    return np.array(sorted(shortest_times.values()))
 
 
 def gap_choices(stays: Visits, entries: Ints, time_step: float, *, longest: float = 15.0) -> tuple[F64, F64]:

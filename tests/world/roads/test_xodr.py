@@ -543,7 +543,7 @@ def test_centres_are_those_of_an_adaptive_quadrature(tmp_path: Path, shape: str)
 
 
 def test_a_map_of_copies_has_the_lanes_of_each(tmp_path: Path) -> None:
-    """What `benchmarks.large_map` measures is a map of separate towns, none of whose lanes is lost."""
+    """The map that `benchmarks.large_map` measures is a map of separate towns, none of whose lanes is lost."""
     town_graph = load_town(TOWN)
     path = tmp_path / "copies.xodr"
     path.write_bytes(large_map(1.2 * len(town_xodr(TOWN))))

@@ -118,7 +118,7 @@ class BasicAgent:
 
     @property
     def plan(self) -> list[tuple[Waypoint, Any]]:
-        """What is left of the plan."""
+        """Return the rest of the plan."""
         return self._plan
 
     def done(self) -> bool:

@@ -12,7 +12,7 @@ from ssad.core.types import F64, Actor, AgentKind, Episode, EpisodeTrace, Pose, 
 from ssad.scenarios.dynamic.catalogue import CUSTOM, parameter_box, scenario_type
 
 CLOSE: Final = 0.0005, 0.0005
-"""How far a row may be off the line between its neighbours to be left out, m and rad.
+"""Greatest distance from the line between its neighbours of a row that is left out, m and rad.
 
 An error of 0.5 mm in the middle of a second difference at steps of 0.1 s is 0.1 m/s^2.
 """

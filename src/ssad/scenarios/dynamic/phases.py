@@ -252,8 +252,8 @@ def _phase_reference_problem(
     if not trigger.phase:
         yield place, "key 'phase' is missing: the name of a phase"
     elif trigger.phase not in names:
-        known = f"its phases: {', '.join(names)}" if names else "none of its phases has a name"
-        yield (*place, "phase"), f"actor {target.name} has no phase '{trigger.phase}'; {known}"
+        phase_names = f"its phases: {', '.join(names)}" if names else "none of its phases has a name"
+        yield (*place, "phase"), f"actor {target.name} has no phase '{trigger.phase}'; {phase_names}"
 
 
 def _constant_condition(trigger: PhaseTrigger, place: Place, actors: Sequence[Actor]) -> Iterator[Problem]:

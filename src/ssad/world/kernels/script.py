@@ -857,16 +857,16 @@ def next_speed(
             held = motion[0]
         script.course[scene_index, agent_index] = wp.vec4(profile[0], held, 0.0, acceleration)
     elif course[0] == SpeedProfile.GAP:
-        kept = gap_speed(
+        gap_motion = gap_speed(
             bank, roads, scripts, state, scene_index, agent_index, base + phase, limits, power[2], profile[2], dt
         )
-        speed = kept[0]
+        speed = gap_motion[0]
         acceleration = (speed - current) / dt
         held = speed
-        if (course[3] & 2) == 0 and kept[1] == 1.0:
+        if (course[3] & 2) == 0 and gap_motion[1] == 1.0:
             is_done = 1
-            held = wp.max(kept[3], 0.0)
-        profile = wp.vec4(profile[0], held, kept[2], acceleration)
+            held = wp.max(gap_motion[3], 0.0)
+        profile = wp.vec4(profile[0], held, gap_motion[2], acceleration)
     else:
         elapsed = float(state.step[scene_index] + 2 - script.begun[scene_index, phase]) * dt
         if elapsed >= profile[2] - ON_TIME:
