@@ -31,7 +31,7 @@ MOST = 20  # scenarios read of a distribution
 SHOWN = 25  # reasons
 PAGE = "results/openscenario-imports.md"
 # Doubts that leave the motion of actors as it is.
-STANDING = re.compile(r"of the stop trigger|no entity is called|can never fire|^map: ")
+STANDING = re.compile(r"of the stop trigger|no entity is called|^map: ")
 
 
 @dataclass
