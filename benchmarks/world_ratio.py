@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-SCENARIOS = ROOT / "src" / "ssad" / "scenarios" / "dynamic" / "data" / "natural-unselected.yaml"
+SCENARIOS = ROOT / "src" / "ssad" / "scenarios" / "dynamic" / "data" / "natural-uniform.yaml"  # other versions read it, too
 WARM = 60  # steps before the first that counts, for traffic to be awake
 
 
