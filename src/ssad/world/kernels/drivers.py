@@ -9,7 +9,7 @@ section 11.3.4), and brakes no harder than the situation needs. Before a stop th
 
 import warp as wp
 
-from ssad.world.kernels.data import Roads
+from ssad.world.kernels.data import FAR, Roads
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -28,6 +28,7 @@ CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
 LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
 LAUNCH = wp.constant(0.4)  # share by which the acceleration from rest is larger
 LAUNCHED = wp.constant(8.0)  # m/s from which on it is the ordinary one
+EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which a driver begins to brake early
 LONGEST_WAIT = wp.constant(20.0)  # s
 PASS_GAP = wp.constant(1.0)  # m that a driver is before a conflict when the other one has left it
 YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
@@ -88,6 +89,19 @@ def driver_stops(own_speed: float, distance: float, style: wp.vec4) -> float:
 
 
 @wp.func
+def early_distance(distance: float, own_speed: float, accel: float, jerk: float, style: wp.vec4) -> float:
+    """Return the distance to a stop less what the driver covers until it brakes comfortably, at least half of it."""
+    lag = 0.5 * wp.max(accel + style[3], 0.0) / jerk
+    return wp.max(distance - own_speed * lag, 0.5 * distance)
+
+
+@wp.func
+def early_react(react: float, early: float, own_speed: float, style: wp.vec4) -> float:
+    """Return the reaction `early` to an earlier place, with no more than `EARLY` where `react` to the place asks less."""
+    return wp.max(early, wp.min(react, -EARLY * style[3] - driver_power(own_speed, style)))
+
+
+@wp.func
 def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
     need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
@@ -105,16 +119,16 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
 
 
 @wp.func
-def driver_lets_pass(own_speed: float, gap: float, time: float, style: wp.vec4) -> float:
-    """Return the reaction to a stretch `gap` metres ahead of the front that another agent leaves in `time` s.
+def driver_arrives_after(own_speed: float, gap: float, time: float, style: wp.vec4) -> float:
+    """Return the reaction with which the front is at a place `gap` metres ahead in `time` s, not at rest.
 
-    The driver arrives just afterwards, with a constant acceleration; where it would have to stop, as `driver_yields`.
+    -FAR where it would have to stop before.
     """
-    react = driver_yields(own_speed, gap, style)
+    react = -FAR
     room = gap - PASS_GAP
     if room > 0.5 * own_speed * time and time < LONGEST_WAIT:
-        react = wp.max(
-            react, 2.0 * (room - own_speed * time) / wp.max(time * time, 0.01) - driver_power(own_speed, style)
+        react = wp.min(
+            2.0 * (room - own_speed * time) / wp.max(time * time, 0.01) - driver_power(own_speed, style), 0.0
         )
     return react
 

@@ -115,6 +115,7 @@ def find_meeting(
             along = wp.clamp(along + step, -BEHIND, reach)
             pose = next_pose
         lateral = float(0.0)
+        residual = float(0.0)
         for _ in range(3):
             frame = way_frame(roads, route[0], route[1], shift, u0 + along)
             rel_x = pose[0] - frame[0]
@@ -133,16 +134,16 @@ def find_meeting(
         width = own_body[1] + margin + other_body[1] * wp.abs(cosine)
         clearance = wp.abs(lateral) - (width + half_length * sine)
         # of a slanting body only the part beside the way counts
-        rear = -half_length
+        back = -half_length
         front = half_length
         if sine > 0.02:
             left = (width - lateral) / slant
             right = (-width - lateral) / slant
-            rear = wp.clamp(wp.min(left, right), -half_length, half_length)
+            back = wp.clamp(wp.min(left, right), -half_length, half_length)
             front = wp.clamp(wp.max(left, right), -half_length, half_length)
-        edge = along + wp.min(rear * cosine, front * cosine) - other_body[1] * sine - own_body[0]
-        exit = along + wp.max(rear * cosine, front * cosine) + other_body[1] * sine + own_body[0]
-        covered = clearance < 0.0 and along < reach and along > -BEHIND
+        edge = along + wp.min(back * cosine, front * cosine) - other_body[1] * sine - own_body[0]
+        exit = along + wp.max(back * cosine, front * cosine) + other_body[1] * sine + own_body[0]
+        covered = clearance < 0.0 and along < reach and along > -BEHIND and wp.abs(residual) < 1.5
         if covered:
             if not covers:
                 entered = 0.0
@@ -153,10 +154,13 @@ def find_meeting(
                 joined = along - other_speed * time - other_body[0] - own_body[0]
             # past the near edge with j behind the middle, braking would only stay in its way
             if edge > 0.0 or along > 0.0:
-                sooner = gained_time(other_speed, other_accel, time) - before
-                if meeting.near < FAR or (
-                    travel_distance(motion, time + SOON) > edge and travel_distance(motion, sooner) < exit
-                ):
+                rear = float(0.0)
+                sooner = gained_time(other_speed, other_accel, time)
+                if cosine > ALIGNED:
+                    rear = travel_distance(motion, sooner) - before * other_speed
+                else:
+                    rear = travel_distance(motion, sooner - before)
+                if meeting.near < FAR or (rear < exit and travel_distance(motion, time + SOON) > edge):
                     if meeting.near >= FAR:
                         meeting.begin = entered
                     meeting.near = wp.min(meeting.near, wp.max(edge, 0.0))
@@ -173,9 +177,8 @@ def find_meeting(
             joins = bool(False)
         covers = covered
         last_clearance = clearance
-    if meeting.near < FAR and meeting.end >= FAR:
-        if meeting.joins == 1:
-            meeting.end = meeting.begin + 2.0 * half_length / other_speed
-        elif sine > 0.5:
-            meeting.end = STRIDE * float(strides) - last_clearance / (other_speed * sine)
+    if meeting.joins == 1:
+        meeting.end = meeting.begin + 2.0 * half_length / other_speed
+    elif meeting.near < FAR and meeting.end >= FAR and sine > 0.5:
+        meeting.end = STRIDE * float(strides) - last_clearance / (other_speed * sine)
     return meeting

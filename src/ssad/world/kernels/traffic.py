@@ -32,12 +32,14 @@ from ssad.world.kernels.drivers import (
     RUNS_RED,
     STOPS_AT_YELLOW,
     YIELD_LEAST,
+    driver_arrives_after,
     driver_follows,
-    driver_lets_pass,
     driver_power,
     driver_speed,
     driver_stops,
     driver_yields,
+    early_distance,
+    early_react,
     is_lapsed,
     judged_share,
 )
@@ -73,6 +75,11 @@ MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
+PASSES = wp.constant(2.0)  # m/s of somebody who is about to pass a driver that stands
+SOON_THERE = wp.constant(3.0)  # s until then
+SLOW = wp.constant(5.0)  # m/s of somebody who starts
+STARTS = wp.constant(0.3)  # m/s^2 of it
+FURTHER = wp.constant(3)  # times the strides ahead that its path is looked along
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
 MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
@@ -86,7 +93,6 @@ PICKS_UP_SHARE = wp.constant(0.8)  # of its acceleration, that a driver reckons 
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
 STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in the way of who passes
-EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which it begins to brake early
 JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
 ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
@@ -127,6 +133,17 @@ def stop_before(v: float, gap: float, style: wp.vec4) -> float:
     if style[0] > 0.0:
         return driver_stops(v, gap, style)
     return idm_gap(v, 0.0, gap)
+
+
+@wp.func
+def stops_early(bank: EpisodeArrays, state: State, b: int, i: int, e: int, speed: float, distance: float) -> float:
+    """Return the reaction to a place before which an agent stops, early enough for the jerk of its driver."""
+    style = bank.style[e, i]
+    react = stop_before(speed, distance, style)
+    if style[0] > 0.0:
+        early = early_distance(distance, speed, state.accel[b, i], bank.manner[e, i][1], style)
+        react = early_react(react, stop_before(speed, early, style), speed, style)
+    return react
 
 
 @wp.func
@@ -517,7 +534,7 @@ def scan_agents(
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
-            react = stop_before(speed, line_gap + 1.0, style)
+            react = stops_early(bank, state, b, i, e, speed, line_gap + 1.0)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
@@ -536,7 +553,7 @@ def scan_agents(
             ):
                 stop = False  # turn to the near side on red, after a stop, where allowed; it yields below
             if stop:
-                react = wp.min(react, stop_before(speed, line_gap + 1.0, style))
+                react = wp.min(react, stops_early(bank, state, b, i, e, speed, line_gap + 1.0))
     state.react[b, i] = react
     state.stalled[b, i] = 0
     work.leader[b, i] = NO_LEADER
@@ -575,7 +592,10 @@ def scan_agents(
             box = perceived.span[b, j]
             last_pose = perceived.forecast[b, j, HORIZON - 1]
             if extra > 0:
-                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
+                far_ahead = extra
+                if perceived.speed[b, j] < SLOW:
+                    far_ahead = FURTHER * extra
+                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + far_ahead)
                 box = extend_box(box, last_pose)
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
                 other_half = perceived.half[b, j]
@@ -682,13 +702,15 @@ def meet_driver(
     top_speed = wp.min(aim[1], bank.manner[e, i][0] * roads.rule[soon][0])
     motion = wp.vec4(speed, PICKS_UP_SHARE * driver_power(speed, style), top_speed, start)
     rule = row(roads.rule, route[0] + place)
-    strides = HORIZON + looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
+    extra = looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
     before = float(LEAST_MARGIN)
     other_accel = float(0.0)
     if not goes_first:
         before = MARGIN
         if j < agents:
             other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
+        if other_accel > STARTS and perceived.speed[b, j] < SLOW:
+            extra = FURTHER * extra
     return find_meeting(
         roads,
         perceived,
@@ -704,7 +726,7 @@ def meet_driver(
         margin,
         before,
         other_accel,
-        strides,
+        HORIZON + extra,
     )
 
 
@@ -735,31 +757,32 @@ def driver_gives_way(
     if j < agents:
         other_accel = state.accel[b, j]
     is_there = meeting.begin < COVERED
-    if goes_first and not is_there:
-        # who has priority relies on the other one that stops already
-        if (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES):
-            return 0.0
-    # until the foot is on the brake
-    lag = 0.5 * wp.max(state.accel[b, i] + style[3], 0.0) / bank.manner[e, i][1]
-    early = wp.max(meeting.near - speed * lag, 0.5 * meeting.near)
-    after = meeting.end + AFTERWARDS
-    react = wp.max(
-        driver_lets_pass(speed, early, after, style),
-        wp.min(driver_lets_pass(speed, meeting.near, after, style), -EARLY * style[3] - driver_power(speed, style)),
-    )
+    other_need = float(FAR)
+    if not is_there:
+        other_need = other_speed / (2.0 * meeting.begin)
+    power = driver_power(speed, style)
+    early = early_distance(meeting.near, speed, state.accel[b, i], bank.manner[e, i][1], style)
+    stop = early_react(driver_yields(speed, meeting.near, style), driver_yields(speed, early, style), speed, style)
+    comes_after = driver_arrives_after(speed, meeting.near, meeting.end + AFTERWARDS, style)
+    react = wp.max(stop, comes_after)
+    stops = (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES)
+    if goes_first and stops and other_need < STILL_STOPS:
+        return 0.0  # the other one stops already
     if meeting.joins == 1 and perceived.kind[b, j] != AgentKind.WALKER:
-        follows = wp.max(
-            driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - driver_power(speed, style)
-        )
+        follows = wp.max(driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - power)
         lead = meeting.gap + bank.body[bank.model[e, i]][0] + perceived.half[b, j][0]
-        if line <= -1.0 or wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > 0.8:
+        if line <= -1.0 or is_there or wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > 0.8:
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            return 0.0
-        if lead > 0.0:
+            if is_there or (not goes_first and meeting.near < ENTERED):
+                return 0.0
+        elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
+            # it is going to be ahead: an early lift of the foot is enough
+            return wp.max(follows, -style[3] - power)
+        elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and not is_there and other_speed < 2.0 * RELIES * meeting.begin:
+    if goes_first and other_need < RELIES:
         return 0.0  # the other one can stop
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
@@ -768,11 +791,10 @@ def driver_gives_way(
         # rolling beyond the line, it stops where the conflict is
         if speed * speed < 3.0 * style[3] * (line + 0.5) and line + 1.0 < meeting.near:
             stop = driver_yields(speed, wp.max(line, 0.0), style)
-            if speed < CREEPS:
-                if react < -0.3 * style[2]:
-                    react = stop
-            elif react <= driver_yields(speed, early, style):
+            if comes_after < -0.3 * power and speed < CREEPS:
                 react = stop
+            else:
+                react = wp.min(react, wp.max(stop, comes_after))
     return react
 
 
@@ -934,6 +956,11 @@ def react_to_agents(
             if style[0] > 0.0:
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first) or judgement[1] > 0.0
+                if speed < STARTS_BELOW and wp.abs(perceived.speed[b, j]) > PASSES:
+                    # who starts lets somebody pass who is about to
+                    other_distance = wp.length(wp.vec2(other_pose[0] - pose[0], other_pose[1] - pose[1]))
+                    if other_distance < SOON_THERE * wp.abs(perceived.speed[b, j]):
+                        goes_first = False
                 meeting = meet_driver(
                     bank, roads, state, perceived, b, i, j, e, agents, longitudinal, margin, goes_first
                 )
