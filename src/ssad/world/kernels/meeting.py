@@ -15,6 +15,7 @@ wp.set_module_options({"max_unroll": 0})  # see `traffic`
 ALIGNED = wp.constant(0.7)  # cosine of two headings that lead the same way
 SOON = wp.constant(0.5)  # s that a driver wants to come after another agent
 SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
+AIR = wp.constant(0.3)  # m before another body
 BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
 ASIDE_LIMIT = wp.constant(14.0)  # m beside the way, beyond which nobody's body reaches it
 STEEPEST = wp.constant(0.3)  # least share of a metre along the other side of a bend
@@ -141,7 +142,7 @@ def find_meeting(
             right = (-width - lateral) / slant
             back = wp.clamp(wp.min(left, right), -half_length, half_length)
             front = wp.clamp(wp.max(left, right), -half_length, half_length)
-        edge = along + wp.min(back * cosine, front * cosine) - other_body[1] * sine - own_body[0]
+        edge = along + wp.min(back * cosine, front * cosine) - other_body[1] * sine - own_body[0] - AIR
         exit = along + wp.max(back * cosine, front * cosine) + other_body[1] * sine + own_body[0]
         covered = clearance < 0.0 and along < reach and along > -BEHIND and wp.abs(residual) < 1.5
         if covered:

@@ -77,6 +77,9 @@ STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
 PASSES = wp.constant(2.0)  # m/s of somebody who is about to pass a driver that stands
 SOON_THERE = wp.constant(3.0)  # s until then
+TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
+WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
+BACKS_TIME = wp.constant(2.0)  # s for which a driver expects somebody to go on backwards
 SLOW = wp.constant(5.0)  # m/s of somebody who starts
 STARTS = wp.constant(0.3)  # m/s^2 of it
 FURTHER = wp.constant(3)  # times the strides ahead that its path is looked along
@@ -766,8 +769,9 @@ def driver_gives_way(
     comes_after = driver_arrives_after(speed, meeting.near, meeting.end + AFTERWARDS, style)
     react = wp.max(stop, comes_after)
     stops = (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES)
-    if goes_first and stops and other_need < STILL_STOPS:
-        return 0.0  # the other one stops already
+    stands = other_speed < WAITING and other_accel < STARTS
+    if goes_first and ((stops and other_need < STILL_STOPS) or (stands and other_need < RELIES)):
+        return 0.0  # the other one stops already, or waits
     if meeting.joins == 1 and perceived.kind[b, j] != AgentKind.WALKER:
         follows = wp.max(driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - power)
         lead = meeting.gap + bank.body[bank.model[e, i]][0] + perceived.half[b, j][0]
@@ -775,7 +779,7 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            if is_there or (not goes_first and meeting.near < ENTERED):
+            if is_there or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
@@ -901,7 +905,10 @@ def react_to_agents(
                 sight,
             )
             if leader[0] < FAR:
-                react = follow(speed, wp.max(leader[1], 0.0), judgement[0] * leader[0], style)
+                leader_gap = judgement[0] * leader[0]
+                if style[0] > 0.0:
+                    leader_gap = wp.max(leader_gap + BACKS_TIME * wp.min(perceived.speed[b, j], 0.0), 0.0)
+                react = follow(speed, wp.max(leader[1], 0.0), leader_gap, style)
                 if (
                     style[0] > 0.0
                     and flags == 3
