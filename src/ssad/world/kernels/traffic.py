@@ -21,6 +21,7 @@ from ssad.world.kernels.data import (
     PerceivedAgents,
     Presence,
     Roads,
+    ScriptMotion,
     State,
     TurnRank,
     Work,
@@ -525,6 +526,15 @@ def conflict_gap(
 
 
 @wp.func
+def is_natural_walker(bank: EpisodeArrays, e: int, j: int) -> bool:
+    """Return whether a row of `PerceivedAgents` is a walker of natural traffic, for which `walkers` has the rules."""
+    natural = bool(False)
+    if j < bank.script.shape[1]:
+        natural = bank.script[e, j][3] == ScriptMotion.WALK
+    return natural
+
+
+@wp.func
 def cannot_meet(
     pose: wp.vec3,
     c: float,
@@ -657,7 +667,7 @@ def scan_agents(
         from_row = agents
         to_row = rows
     for j in range(from_row, to_row):
-        if j != i and perceived.kind[b, j] != AgentKind.NONE:
+        if j != i and perceived.kind[b, j] != AgentKind.NONE and not is_natural_walker(bank, e, j):
             box = perceived.span[b, j]
             last_pose = perceived.forecast[b, j, HORIZON - 1]
             if extra > 0:
