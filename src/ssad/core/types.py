@@ -467,6 +467,8 @@ class DriverStyle:
         lane_offset: Mean place left of the middle of the lane, m.
         errors: Errors an hour: a moment in which the driver reacts late and misses who has priority.
         key: Number from which the driver's errors are drawn, below 2^24.
+        politeness: Weight of the acceleration that a lane change costs or brings others (MOBIL).
+        change_duration: Time that a lane change takes where there is room, s.
     """
 
     time_gap: float
@@ -480,6 +482,50 @@ class DriverStyle:
     lane_offset: float = 0.0
     errors: float = 0.0
     key: int = 0
+    politeness: float = 0.35
+    change_duration: float = 5.0
+
+
+@dataclass(frozen=True)
+class WalkCrossing:
+    """Place at which a walker's route leads over a road. Distances are along the route.
+
+    Attributes:
+        crossing: Number of the crossing in `ssad.world.roads.sidewalks.sidewalk_network`.
+        wait: Distance to where the walker waits, m.
+        kerb: Distance to the edge of the road, m.
+        far: Distance to its opposite edge, m.
+        forward: Whether it walks from the first end of the crossing to the second.
+    """
+
+    crossing: int
+    wait: float
+    kerb: float
+    far: float
+    forward: bool
+
+
+@dataclass(frozen=True)
+class WalkStyle:
+    """Behaviour of a walker of natural traffic, in place of phases.
+
+    Attributes:
+        crossings: Roads that it crosses on its way, in order.
+        margin: Time between itself and a vehicle with which it is content when it enters a road, s.
+        room: Half width that its way offers to it, m.
+        offset: Mean place left of the middle of the pavement, m.
+        group: Name of the walker that decides when its group crosses; "": it decides itself.
+        row: Distance at which it walks behind that one, m.
+        depth: Distance from it to the last one that follows it, m.
+    """
+
+    crossings: tuple[WalkCrossing, ...] = ()
+    margin: float = 2.0
+    room: float = 1.0
+    offset: float = 0.0
+    group: str = ""
+    row: float = 0.0
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -496,6 +542,7 @@ class TrafficPlan:
             published distributions.
         errors: Errors of each driver of the population an hour; see `DriverStyle`.
         walkers: Number of walkers on the sidewalks near the route, alone and in groups; fewer where there is no room.
+            They cross roads.
         cyclists: Number of cyclists on the driving lanes near the route; fewer where there is no room.
     """
 
@@ -644,6 +691,7 @@ class EpisodeAgent:
         driver: Parameters of its driver under AUTOPILOT; None: those that all Autopilots have.
         lateral: Lateral phases under SCRIPT; they need a route.
         lateral_targets: Distance left of the route to which each lateral phase leads, at every route point [N], m.
+        walk: Behaviour of a walker of natural traffic under SCRIPT; it needs a route and has no phases.
     """
 
     name: str
@@ -661,6 +709,7 @@ class EpisodeAgent:
     lateral: tuple[LateralPhase, ...] = ()
     lateral_targets: tuple[F32, ...] = ()
     driver: DriverStyle | None = None
+    walk: WalkStyle | None = None
 
 
 @dataclass(frozen=True)

@@ -592,8 +592,9 @@ def begin_all(
         if scripts.ring[condition][1] > 0 or scripts.condition[condition][0] == PhaseCondition.STANDSTILL:
             remember(bank, roads, scripts, state, script, scene_index, condition, dt)
     for agent_index in range(agents):
+        kind = bank.script[episode, agent_index][3]
         if (
-            bank.script[episode, agent_index][3] != ScriptMotion.NONE
+            (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL)
             and state.active[scene_index, agent_index] == Presence.AWAKE
         ):
             if begin_phases(bank, roads, scripts, state, script, scene_index, agent_index, dt) == 1:
@@ -1036,8 +1037,9 @@ def run_scripts(
         while begins == 1:
             begins = begin_all(bank, roads, scripts, state, script, scene_index, agents, dt)
     for agent_index in range(agents):
+        kind = bank.script[episode, agent_index][3]
         if (
-            bank.script[episode, agent_index][3] != ScriptMotion.NONE
+            (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL)
             and state.active[scene_index, agent_index] == Presence.AWAKE
         ):
             run_one(bank, roads, scripts, state, script, scene_index, agent_index, dt)
