@@ -15,6 +15,7 @@ wp.set_module_options({"max_unroll": 0})  # see `traffic`
 ALIGNED = wp.constant(0.7)  # cosine of two headings that lead the same way
 SOON = wp.constant(0.5)  # s that a driver wants to come after another agent
 SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
+MOST_GAIN = wp.constant(2.5)  # m/s^2
 AIR = wp.constant(0.3)  # m before another body
 BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
 ASIDE_LIMIT = wp.constant(14.0)  # m beside the way, beyond which nobody's body reaches it
@@ -156,7 +157,7 @@ def find_meeting(
             # past the near edge with j behind the middle, braking would only stay in its way
             if edge > 0.0 or along > 0.0:
                 rear = float(0.0)
-                sooner = gained_time(other_speed, other_accel, time)
+                sooner = gained_time(other_speed, wp.min(other_accel, MOST_GAIN), time)
                 if cosine > ALIGNED:
                     rear = travel_distance(motion, sooner) - before * other_speed
                 else:

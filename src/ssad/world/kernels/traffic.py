@@ -76,7 +76,7 @@ MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
-PASSES = wp.constant(2.0)  # m/s of somebody who is about to pass a driver that stands
+PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
 SOON_THERE = wp.constant(3.0)  # s until then
 TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
 WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
@@ -718,10 +718,12 @@ def meet_driver(
     extra = looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
     before = float(LEAST_MARGIN)
     other_accel = float(0.0)
-    if not goes_first:
+    if j < agents:
+        other_accel = state.accel[b, j]
+    if goes_first:
+        other_accel = wp.min(other_accel, 0.0)
+    else:
         before = MARGIN
-        if j < agents:
-            other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
         if other_accel > STARTS and perceived.speed[b, j] < SLOW:
             extra = FURTHER * extra
     return find_meeting(
@@ -789,7 +791,8 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            if is_there or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            parallel = wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > 0.8
+            if is_there or parallel or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
