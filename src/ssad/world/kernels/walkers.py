@@ -485,9 +485,7 @@ def walk_one(
                 status = WalkStatus.CROSSING
                 crossing = number + 1
                 room = wp.max(walkers.form[number][0] - 0.4, style[1])
-                wish = speed_on_road(
-                    bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents
-                )
+                wish = speed_on_road(bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents)
             elif to_wait < NEAR_KERB * cruise:
                 crossing = number + 1
                 status = WalkStatus.WAITING
@@ -513,9 +511,7 @@ def walk_one(
                 if may_go:
                     signal = int(NO_SIGNAL)
                     if not follows:
-                        signal = crossing_signal(
-                            bank, roads, walkers, e, number, stage, progress, depth, cruise, time
-                        )
+                        signal = crossing_signal(bank, roads, walkers, e, number, stage, progress, depth, cruise, time)
                     if signal == GAPS:
                         has_right = 0
                     if signal != CLOSED:
