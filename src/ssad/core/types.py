@@ -174,6 +174,7 @@ class Body:
 
 
 DEFAULT_FRICTION = 0.9  # of a dry road
+MOVING = 0.5  # m/s; an agent that is slower stands
 
 
 @dataclass(frozen=True)
