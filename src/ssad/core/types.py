@@ -165,6 +165,7 @@ class Body:
 
 
 DEFAULT_FRICTION = 0.9  # of a dry road
+MOVING = 0.5  # m/s; an agent that is slower stands
 
 
 @dataclass(frozen=True)
@@ -466,6 +467,8 @@ class DriverStyle:
         lane_offset: Mean place left of the middle of the lane, m.
         errors: Errors an hour: a moment in which the driver reacts late and misses who has priority.
         key: Number from which the driver's errors are drawn, below 2^24.
+        politeness: Weight of the acceleration that a lane change costs or brings others (MOBIL).
+        change_duration: Time that a lane change takes where there is room, s.
     """
 
     time_gap: float
@@ -479,6 +482,8 @@ class DriverStyle:
     lane_offset: float = 0.0
     errors: float = 0.0
     key: int = 0
+    politeness: float = 0.35
+    change_duration: float = 5.0
 
 
 @dataclass(frozen=True)

@@ -333,6 +333,7 @@ def _put_agent(  # noqa: PLR0917
         a["style"][e, i] = driver.time_gap, driver.standstill_gap, driver.acceleration, driver.deceleration
         a["manner"][e, i] = driver.pace, driver.jerk, driver.reaction_time, driver.estimation_error
         a["habit"][e, i] = driver.lane_offset, driver.errors, driver.key
+        a["courtesy"][e, i] = driver.politeness, driver.change_duration
     a["route"][e, i] = route
     a["track"][e, i] = track
 
@@ -412,6 +413,7 @@ def build(  # noqa: PLR0917
         "style": np.zeros((*shape, 4), np.float32),
         "manner": np.zeros((*shape, 4), np.float32),
         "habit": np.zeros((*shape, 3), np.float32),
+        "courtesy": np.zeros((*shape, 2), np.float32),
         "cruise": np.zeros((*shape, 2), np.float32),
         "route": np.zeros((*shape, 2), np.int32),
         "track": np.zeros((*shape, 2), np.int32),

@@ -34,9 +34,9 @@ from ssad.world.kernels.data import (
     array_types,
 )
 from ssad.world.kernels.drive import drive
+from ssad.world.kernels.lane_choice import change_lanes
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import advance_noise, reset_noise
-from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.script import restart_scripts, run_scripts
 from ssad.world.kernels.traffic import react_to_agents, scan_all_agents

@@ -127,7 +127,9 @@ def test_without_spread_the_episodes_are_what_they_were(name: str) -> None:
         every = {s.name: s for s in load_scenarios("natural-unselected")}
         routes = [f"{name}_{i:02d}" for i in range(ROUTES[name])]
         scenarios = [
-            dataclasses.replace(every[f"natural-unselected/{route}/00"], name=f"natural/{route}/{k:02d}", seed=k)
+            dataclasses.replace(
+                every[f"natural-unselected/{route}/00"], name=f"natural/{route}/{k:02d}", seed=k, traffic=None
+            )
             for route in routes
             for k in range(10)
         ]

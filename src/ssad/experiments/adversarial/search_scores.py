@@ -15,8 +15,7 @@ import numpy as np
 from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.proven_collisions import MOVING
+from ssad.core.types import F64, MOVING, AgentKind, EpisodeTrace
 from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein
 from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
