@@ -384,6 +384,8 @@ def make_way(
                 other_speed = state.speed[b, other] * facing
                 is_walker = bank.kind[bank.model[e, other]] == AgentKind.WALKER
                 in_group = walkers.leader[e, other] == walkers.leader[e, j]
+                if not is_walker:
+                    width = width + 0.1
                 overlap = width + AIR - wp.abs(beside)
                 if ahead > 0.0 and overlap > 0.0:
                     slower = wish - other_speed > 0.1
