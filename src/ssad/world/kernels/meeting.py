@@ -18,7 +18,8 @@ SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
 MOST_GAIN = wp.constant(2.5)  # m/s^2
 AIR = wp.constant(0.3)  # m before another body
 BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
-ASIDE_LIMIT = wp.constant(14.0)  # m beside the way, beyond which nobody's body reaches it
+PROJECTIONS = wp.constant(3)  # Newton steps with which a place is located along the way
+LOCATED = wp.constant(1.5)  # m that may be left of it
 STEEPEST = wp.constant(0.3)  # least share of a metre along the other side of a bend
 
 
@@ -100,6 +101,8 @@ def find_meeting(
     other_speed = wp.max(wp.abs(perceived.speed[b, j]), 0.1)
     # long enough that a fast, short agent is not before the way at one place and behind it at the next
     half_length = wp.max(other_body[0], 0.5 * STRIDE * wp.abs(perceived.speed[b, j]) - own_body[1])
+    # further aside, no body reaches the way
+    aside = own_body[1] + margin + half_length + other_body[1]
     reach = motion[2] * STRIDE * float(strides) + own_body[0] + half_length
     along = wp.clamp(lon, -BEHIND, reach)
     pose = perceived.pose[b, j]
@@ -119,34 +122,39 @@ def find_meeting(
             pose = next_pose
         lateral = float(0.0)
         residual = float(0.0)
-        for _ in range(3):
+        for _ in range(PROJECTIONS):
             frame = way_frame(roads, route[0], route[1], shift, u0 + along)
             rel_x = pose[0] - frame[0]
             rel_y = pose[1] - frame[1]
             residual = rel_x * frame[2] + rel_y * frame[3]
             lateral = rel_y * frame[2] - rel_x * frame[3]
-            if wp.abs(residual) < 0.1 or wp.abs(lateral) > ASIDE_LIMIT:
+            if wp.abs(residual) < 0.1 or wp.abs(lateral) > aside + wp.abs(residual):
                 break
             curvature = roads.path[route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)][3]
             along = wp.clamp(along + residual / wp.max(1.0 - curvature * lateral, STEEPEST), -BEHIND, reach)
-        other_cos = wp.cos(pose[2])
-        other_sin = wp.sin(pose[2])
-        cosine = other_cos * frame[2] + other_sin * frame[3]
-        slant = other_sin * frame[2] - other_cos * frame[3]
-        sine = wp.abs(slant)
-        width = own_body[1] + margin + other_body[1] * wp.abs(cosine)
-        clearance = wp.abs(lateral) - (width + half_length * sine)
-        # of a slanting body only the part beside the way counts
-        back = -half_length
-        front = half_length
-        if sine > 0.02:
-            left = (width - lateral) / slant
-            right = (-width - lateral) / slant
-            back = wp.clamp(wp.min(left, right), -half_length, half_length)
-            front = wp.clamp(wp.max(left, right), -half_length, half_length)
-        edge = along + wp.min(back * cosine, front * cosine) - other_body[1] * sine - own_body[0] - AIR
-        exit = along + wp.max(back * cosine, front * cosine) + other_body[1] * sine + own_body[0]
-        covered = clearance < 0.0 and along < reach and along > -BEHIND and wp.abs(residual) < 1.5
+        clearance = wp.abs(lateral) - aside
+        edge = float(0.0)
+        exit = float(0.0)
+        cosine = float(0.0)
+        if clearance < 0.0 and wp.abs(residual) < LOCATED:
+            other_cos = wp.cos(pose[2])
+            other_sin = wp.sin(pose[2])
+            cosine = other_cos * frame[2] + other_sin * frame[3]
+            slant = other_sin * frame[2] - other_cos * frame[3]
+            sine = wp.abs(slant)
+            width = own_body[1] + margin + other_body[1] * wp.abs(cosine)
+            clearance = wp.abs(lateral) - (width + half_length * sine)
+            # of a slanting body only the part beside the way counts
+            back = -half_length
+            front = half_length
+            if sine > 0.02:
+                left = (width - lateral) / slant
+                right = (-width - lateral) / slant
+                back = wp.clamp(wp.min(left, right), -half_length, half_length)
+                front = wp.clamp(wp.max(left, right), -half_length, half_length)
+            edge = along + wp.min(back * cosine, front * cosine) - other_body[1] * sine - own_body[0] - AIR
+            exit = along + wp.max(back * cosine, front * cosine) + other_body[1] * sine + own_body[0]
+        covered = clearance < 0.0 and along < reach and along > -BEHIND and wp.abs(residual) < LOCATED
         if covered:
             if not covers:
                 entered = 0.0
