@@ -1,11 +1,11 @@
 """Films of traffic from above: `python -m benchmarks.traffic_film --town Twinford --minutes 5 --out DIR`.
 
 Drives one scene as `benchmarks.traffic` does, with drivers of the population, walkers and cyclists, and draws its
-busiest junctions side by side: lanes, stop lines in the colour of their signal, brake lights, turn signals, the number of
-each agent, and the clock. The recorded drive lies beside the film (`TOWN.npz`) and is used again: `--at X,Y` shows
-another place, `--agent N` goes with an agent, `--whole` shows the town, `--begin S --end S` take a part, and `--sheet S`
-writes pictures S seconds apart on one sheet instead of a film. The command prints what is worth a look: contacts,
-bodies that nearly touch, hard braking, vehicles that stand although nothing holds them.
+busiest junctions side by side: lanes, stop lines in the colour of their signal, brake lights, turn signals, the number
+and the speed of each agent, and the clock. The recorded drive lies beside the film (`TOWN.npz`) and is used again:
+`--at X,Y` shows another place, `--agent N` goes with an agent, `--whole` shows the town, `--begin S --end S` take a
+part, and `--sheet S` writes pictures S seconds apart on one sheet instead of a film. The command prints what is worth a
+look: contacts, bodies that nearly touch, hard braking, vehicles that stand although nothing holds them.
 """
 
 from __future__ import annotations
@@ -410,7 +410,7 @@ def _numbers(text: str) -> tuple[float, float]:
 
 
 def recorded(graph: LaneGraph, given: argparse.Namespace) -> tuple[Drive, bool]:
-    """Return the drive in the output folder if it is that of the same command, else a new one, and whether it is new."""
+    """Return the drive in the output folder if it is of the same command, else a new one, and whether it is new."""
     file, same = given.out / f"{graph.name}.npz", ("minutes", "drivers", "vehicles", "walkers", "cyclists", "seed")
     about = json.dumps({"world": VERSION} | {name: getattr(given, name) for name in same})
     if file.is_file():
