@@ -38,9 +38,17 @@ from ssad.core.types import (
     Route,
     Scenario,
     SignalState,
+    TrafficPlan,
 )
 from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
+from ssad.scenarios.dynamic.knowledge.vulnerable_users import (
+    EDGE,
+    MAX_SPEED_LIMIT,
+    cyclist,
+    cycling_route,
+    draw_walkers,
+)
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
 from ssad.world.roads import load_town, random_route
@@ -93,9 +101,21 @@ def town_routes(graph: LaneGraph, count: int, length: float) -> list[Route]:
 
 
 def traffic(
-    graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: int, green: bool, drivers: str = "uniform"
+    graph: LaneGraph,
+    routes: Sequence[Route],
+    vehicles: int,
+    *,
+    key: int,
+    green: bool,
+    drivers: str = "uniform",
+    walkers: int = 0,
+    cyclists: int = 0,
+    seconds: float = 300.0,
 ) -> Episode:
-    """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads."""
+    """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads.
+
+    Walkers walk for `seconds`.
+    """
     draws = generator("traffic", graph.name, key)
     agents: list[EpisodeAgent] = []
     for number in draws.permutation(len(routes)).tolist():
@@ -115,11 +135,38 @@ def traffic(
             # how fast it likes to go is its driver's pace
             agent = with_driver(replace(agent, target_speed=float(route.speed_limit.max())), key, len(agents))
         agents.append(agent)
+    if cyclists:
+        agents += town_cyclists(graph, routes, agents, cyclists, key)
+    plan = TrafficPlan(walkers=walkers)
+    agents += draw_walkers(plan, graph, None, agents, seconds, "traffic", graph.name, key)
     limits = EpisodeLimits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
     scenario = Scenario(f"traffic/{key}", "Custom", graph.name, (agents[0].pose, agents[0].pose), limits=limits)
     real = np.flatnonzero(~graph.signal_virtual).tolist()
     forced = dict.fromkeys(real, SignalState.GREEN) if green else {}
     return Episode(f"traffic/{graph.name}/{key}", scenario, graph.name, tuple(agents), forced, 1e6, limits)
+
+
+def town_cyclists(
+    graph: LaneGraph, routes: Sequence[Route], others: Sequence[EpisodeAgent], count: int, key: int
+) -> list[EpisodeAgent]:
+    """Draw cyclists on those of the ways that begin on an outermost lane."""
+    draws = generator("traffic cyclists", graph.name, key)
+    beside = graph.left if graph.left_hand[0] else graph.right
+    agents: list[EpisodeAgent] = []
+    for number in draws.permutation(len(routes)).tolist():
+        if len(agents) == count:
+            break
+        route = routes[number]
+        neighbour = int(beside[route.lane[0]])
+        is_fast = float(route.speed_limit[0]) > MAX_SPEED_LIMIT
+        if is_fast or (neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING):
+            continue
+        path = cycling_route(graph, route, float(draws.uniform(*EDGE)))
+        start = tuple(path.xy[0].tolist())
+        if any(math.dist((agent.pose.x, agent.pose.y), start) < APART for agent in (*others, *agents)):
+            continue
+        agents.append(cyclist(f"cyclist {len(agents) + 1}", path, 0.0, draws))
+    return agents
 
 
 def patience(graph: LaneGraph) -> float:

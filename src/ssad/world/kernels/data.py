@@ -143,6 +143,7 @@ class EpisodeArrays:
     # [E, A] driver: desired speed over the limit, jerk m/s^3, reaction time s, estimation error
     manner: wp.array2d(dtype=wp.vec4)
     habit: wp.array2d(dtype=wp.vec3)  # [E, A] driver: place left of the lane's middle m, errors an hour, key
+    courtesy: wp.array2d(dtype=wp.vec2)  # [E, A] driver: politeness (MOBIL), s that a lane change takes
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
@@ -277,7 +278,9 @@ class Walkers:
     depth: wp.array2d(dtype=wp.float32)  # [E, A] m from the leader of a group to the last one
     leader: wp.array2d(dtype=wp.int32)  # [E, A] agent that decides, itself where it is alone; -1: no walker
     stages: wp.array2d(dtype=wp.vec2i)  # [E, A] first row of `stage`, number of rows
-    stage: wp.array(dtype=wp.vec4)  # [W] m along the way to where it waits, to both kerbs, and 1 towards greater y or -1
+    stage: wp.array(
+        dtype=wp.vec4
+    )  # [W] m along the way to where it waits, to both kerbs, and 1 towards greater y or -1
     stage_crossing: wp.array(dtype=wp.int32)  # [W] crossing
     crossing: wp.array(dtype=wp.vec4)  # [C] x, y of the first end, unit vector towards the second
     form: wp.array(dtype=wp.vec4)  # [C] half width m, y of both kerbs, 1 marked

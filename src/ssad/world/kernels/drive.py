@@ -24,6 +24,7 @@ from ssad.world.kernels.drivers import (
     NOTICES,
     delay,
     driver_accelerates,
+    driver_power,
     is_lapsed,
     lane_place,
     pedal_change,
@@ -105,7 +106,7 @@ def driven_acceleration(
     # predictions flicker from step to step: a driver sees them as one
     reaction = state.pending[b, i][1]
     reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
-    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + reaction)
+    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), driver_power(speed, style) + reaction)
     junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:
         if demand <= STARTS:
@@ -213,8 +214,8 @@ def drive_one(
             accel = wp.clamp(2.0 * (target_speed - speed), -power[1], power[0])
         throttle = wp.clamp(accel / wp.max(power[0], 0.1), 0.0, 1.0)
         brake = wp.clamp(-accel / wp.max(power[1], 0.1), 0.0, 1.0)
-        if speed < 0.2 and accel <= 0.0:
-            brake = 1.0
+        if speed < 0.2 and accel <= 0.0 and not has_driver:
+            brake = 1.0  # drivers of the population come to rest without a jolt
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
         if controller == Controller.AUTOPILOT and state.stalled[b, i] == 1 and speed < 0.3:
             from_row = int(0)

@@ -9,7 +9,7 @@ section 11.3.4), and brakes no harder than the situation needs. Before a stop th
 
 import warp as wp
 
-from ssad.world.kernels.data import Roads
+from ssad.world.kernels.data import FAR, Roads
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -26,6 +26,11 @@ HARDEST = wp.constant(9.0)  # m/s^2
 CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
 LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
+LAUNCH = wp.constant(0.4)  # share by which the acceleration from rest is larger
+LAUNCHED = wp.constant(8.0)  # m/s from which on it is the ordinary one
+EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which a driver begins to brake early
+LONGEST_WAIT = wp.constant(20.0)  # s
+PASS_GAP = wp.constant(1.0)  # m that a driver is before a conflict when the other one has left it
 YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
 YIELD_LEAST = wp.constant(0.4)  # m before it at which a driver stops who is late
 SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
@@ -38,18 +43,28 @@ WANDER = wp.constant(0.05)  # m of it
 
 
 @wp.func
+def driver_power(own_speed: float, style: wp.vec4) -> float:
+    """Return the acceleration that the driver wants on a free road, m/s^2: stronger from rest than while following.
+
+    Source: the falling acceleration of starts, Long (2000), Transportation Research Record 1737.
+    """
+    return style[2] * (1.0 + LAUNCH * wp.clamp(1.0 - own_speed / LAUNCHED, 0.0, 1.0))
+
+
+@wp.func
 def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a leader `gap` metres ahead that drives at `leader_speed` m/s."""
     closing = own_speed * (own_speed - leader_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, own_speed * style[0] + closing)) / wp.max(gap, 0.1)
-    wish = style[2] * (1.0 - ratio * ratio)
+    power = driver_power(own_speed, style)
+    wish = power * (1.0 - ratio * ratio)
     room = wp.max(gap - LAST_GAP, 0.2)
     slower = wp.max(own_speed - leader_speed, 0.0)
     need = wp.max(
         slower * slower / (2.0 * room),
         own_speed * own_speed / (2.0 * (room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
     )
-    return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - style[2]
+    return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - power
 
 
 @wp.func
@@ -61,15 +76,29 @@ def driver_stops(own_speed: float, distance: float, style: wp.vec4) -> float:
     room = wp.max(distance - 0.8 * style[1], 0.3)
     need = own_speed * own_speed / (2.0 * room)
     share = need / style[3]
-    allowed = style[2] - (style[2] + style[3]) * share * share
+    power = driver_power(own_speed, style)
+    allowed = power - (power + style[3]) * share * share
     if share > 1.0:
         # who is late stops nearer to the place
         late = own_speed * own_speed / (2.0 * wp.max(distance - LAST_GAP, 0.3))
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if distance < style[1]:
         ratio = style[1] / wp.max(distance, 0.1)
-        allowed = wp.min(allowed, wp.max(style[2] * (1.0 - ratio * ratio), -style[3]))
-    return allowed - style[2]
+        allowed = wp.min(allowed, wp.max(power * (1.0 - ratio * ratio), -style[3]))
+    return allowed - power
+
+
+@wp.func
+def early_distance(distance: float, own_speed: float, accel: float, jerk: float, style: wp.vec4) -> float:
+    """Return the distance to a stop less what the driver covers until it brakes comfortably, at least half of it."""
+    lag = 0.5 * wp.max(accel + style[3], 0.0) / jerk
+    return wp.max(distance - own_speed * lag, 0.5 * distance)
+
+
+@wp.func
+def early_react(react: float, early: float, own_speed: float, style: wp.vec4) -> float:
+    """Return the reaction `early` to an earlier place, with no more than `EARLY` where `react` to the place asks less."""
+    return wp.max(early, wp.min(react, -EARLY * style[3] - driver_power(own_speed, style)))
 
 
 @wp.func
@@ -77,7 +106,8 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
     need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
-    allowed = style[2] - (style[2] + style[3]) * share * share
+    power = driver_power(own_speed, style)
+    allowed = power - (power + style[3]) * share * share
     if share > 1.0:
         late = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
         if own_speed < CREEPS:
@@ -85,7 +115,22 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
         allowed = wp.min(allowed, -0.2 * style[3])
-    return allowed - style[2]
+    return allowed - power
+
+
+@wp.func
+def driver_arrives_after(own_speed: float, gap: float, time: float, style: wp.vec4) -> float:
+    """Return the reaction with which the front is at a place `gap` metres ahead in `time` s, not at rest.
+
+    -FAR where it would have to stop before.
+    """
+    react = -FAR
+    room = gap - PASS_GAP
+    if room > 0.5 * own_speed * time and time < LONGEST_WAIT:
+        react = wp.min(
+            2.0 * (room - own_speed * time) / wp.max(time * time, 0.01) - driver_power(own_speed, style), 0.0
+        )
+    return react
 
 
 @wp.func
@@ -108,7 +153,7 @@ def driver_accelerates(own_speed: float, target: float, style: wp.vec4) -> float
     if own_speed > target:
         return wp.max(-1.5 * (own_speed - target), -style[3])
     ratio = own_speed / wp.max(target, 0.1)
-    return style[2] * (1.0 - ratio * ratio * ratio * ratio)
+    return driver_power(own_speed, style) * (1.0 - ratio * ratio * ratio * ratio)
 
 
 @wp.func

@@ -57,9 +57,13 @@ HURRY = wp.constant(1.5)  # times its speed, at which a walker gets out of the w
 PICKS_UP = wp.constant(1.5)  # m/s^2 that a driver expects of itself
 CLEARS = wp.constant(0.7)  # s between a walker and the vehicle that comes after it
 PASSES = wp.constant(1.5)  # s between a vehicle and the walker that comes after it
+TOUCHES = wp.constant(0.4)  # m from a vehicle's side to the middle of a walker before which it does not move
 COMFORT = wp.constant(2.0)  # m/s^2 with which a driver brakes for a walker who waits
-LINE = wp.constant(1.0)  # m before a crossing at which drivers stop
+LINE = wp.constant(0.3)  # m less than its gap at rest, at which a driver stops before a crossing
+NOSE = wp.constant(0.8)  # m on a crossing up to which a vehicle still waits there
 SIDESTEP = wp.constant(0.4)  # m/s to the side
+SQUEEZES = wp.constant(0.3)  # m/s of a walker past another one where there is no room
+LEANS = wp.constant(0.35)  # rad from its way that a walker turns at most
 AIR = wp.constant(0.15)  # m between walkers that pass each other
 LOOKS_AHEAD = wp.constant(5.0)  # m within which a walker makes way
 STRAGGLES = wp.constant(2.5)  # m behind its place from which a walker no longer crosses with its group
@@ -336,9 +340,11 @@ def make_way(
     bank: EpisodeArrays,
     state: State,
     walkers: Walkers,
+    walk: WalkState,
     b: int,
     j: int,
     e: int,
+    way_yaw: float,
     left: float,
     room: float,
     wish: float,
@@ -346,11 +352,12 @@ def make_way(
 ) -> wp.vec2:
     """Return the place left of its way to which a walker goes, m, and the speed that bodies ahead leave to it, m/s.
 
-    Two that meet pass on the right; whoever is slower is passed where there is room, or followed.
+    Two that meet pass on the right; whoever is slower is passed where there is room, or followed. Walkers do not stop
+    for each other for ever: where there is no room they squeeze past.
     """
     pose = state.pose[b, j]
-    cosine = wp.cos(pose[2])
-    sine = wp.sin(pose[2])
+    cosine = wp.cos(way_yaw)
+    sine = wp.sin(way_yaw)
     own_half = bank.body[bank.model[e, j]]
     style = walkers.style[e, j]
     low = -room - style[2]
@@ -368,8 +375,8 @@ def make_way(
             if dx * dx + dy * dy < reach * reach:
                 ahead = dx * cosine + dy * sine
                 beside = dy * cosine - dx * sine
-                facing = wp.cos(other_pose[2] - pose[2])
-                across = wp.abs(wp.sin(other_pose[2] - pose[2]))
+                facing = wp.cos(other_pose[2] - way_yaw)
+                across = wp.abs(wp.sin(other_pose[2] - way_yaw))
                 half_along = body[0] * wp.abs(facing) + body[1] * across
                 half_across = body[0] * across + body[1] * wp.abs(facing)
                 gap = ahead - half_along - own_half[0]
@@ -377,6 +384,8 @@ def make_way(
                 other_speed = state.speed[b, other] * facing
                 is_walker = bank.kind[bank.model[e, other]] == AgentKind.WALKER
                 in_group = walkers.leader[e, other] == walkers.leader[e, j]
+                if not is_walker:
+                    width = width + 0.1
                 overlap = width + AIR - wp.abs(beside)
                 if ahead > 0.0 and overlap > 0.0:
                     slower = wish - other_speed > 0.1
@@ -395,13 +404,18 @@ def make_way(
                         greatest = overlap
                     is_blocked = wp.abs(beside) < width - 0.02
                     if is_blocked and is_walker:
-                        if crosses:
+                        least = wp.min(wish, SQUEEZES)
+                        if walk.status[b, other] == WalkStatus.WAITING or walk.status[b, other] == WalkStatus.READY:
+                            least = 0.0  # it stands at the kerb, and whoever wants to cross waits behind it
+                        if facing < -0.3:
+                            if gap < 1.5:
+                                limit = wp.min(limit, wp.max(0.5 * wish, wp.min(wish, SQUEEZES)))
+                        elif crosses:
                             if j > other and gap < 1.0:
-                                limit = wp.min(limit, wp.max(gap - 0.1, 0.0))
-                        elif facing > -0.3 or wp.abs(state.speed[b, other]) < 0.2:
-                            limit = wp.min(limit, wp.max(other_speed, 0.0) + 0.8 * wp.max(gap - 0.1, 0.0))
-                        elif gap < 1.5:
-                            limit = wp.min(limit, wp.max(0.5 * wish, 0.5))
+                                limit = wp.min(limit, wp.max(gap - 0.1, least))
+                        else:
+                            follows = wp.max(other_speed, 0.0) + 0.8 * wp.max(gap - 0.1, 0.0)
+                            limit = wp.min(limit, wp.max(follows, least))
                     elif is_blocked:
                         limit = wp.min(limit, wp.sqrt(SLOWS * wp.max(gap - 0.4, 0.0)))
     return wp.vec2(target, limit)
@@ -473,9 +487,7 @@ def walk_one(
                 status = WalkStatus.CROSSING
                 crossing = number + 1
                 room = wp.max(walkers.form[number][0] - 0.4, style[1])
-                wish = speed_on_road(
-                    bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents
-                )
+                wish = speed_on_road(bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents)
             elif to_wait < NEAR_KERB * cruise:
                 crossing = number + 1
                 status = WalkStatus.WAITING
@@ -501,9 +513,7 @@ def walk_one(
                 if may_go:
                     signal = int(NO_SIGNAL)
                     if not follows:
-                        signal = crossing_signal(
-                            bank, roads, walkers, e, number, stage, progress, depth, cruise, time
-                        )
+                        signal = crossing_signal(bank, roads, walkers, e, number, stage, progress, depth, cruise, time)
                     if signal == GAPS:
                         has_right = 0
                     if signal != CLOSED:
@@ -535,12 +545,14 @@ def walk_one(
                     walk.waited[b, j] = walk.waited[b, j] + dt
     walk.status[b, j] = status
     walk.crossing[b, j] = crossing
-    way = make_way(bank, state, walkers, b, j, e, rail[1], room, wish, agents)
+    here = route_at(roads, route[0], route[1], rail[0])
+    way = make_way(bank, state, walkers, walk, b, j, e, here[2], rail[1], room, wish, agents)
     new_speed = wp.max(speed + wp.clamp(way[1] - speed, -SLOWS * dt, SPEEDS_UP * dt), 0.0)
     length = 0.5 * (speed + new_speed) * dt
     sidestep = float(0.0)
     if wish > 0.05:
-        sidestep = wp.clamp(way[0] - rail[1], -SIDESTEP * dt, SIDESTEP * dt)
+        greatest = wp.min(SIDESTEP, LEANS * wp.max(speed, 0.4)) * dt
+        sidestep = wp.clamp(way[0] - rail[1], -greatest, greatest)
     last = float(route[1] - 1)
     place = wp.min(rail[0] + length, last)
     if place >= last:
@@ -550,7 +562,7 @@ def walk_one(
     way_pose = route_at(roads, route[0], route[1], place)
     heading = pose[2]
     if length > 0.02:
-        heading = way_pose[2] + wp.atan2(sidestep, length)
+        heading = way_pose[2] + wp.clamp(wp.atan2(sidestep, length), -LEANS, LEANS)
     script.goal[b, j] = wp.vec4(
         way_pose[0] - left * wp.sin(way_pose[2]),
         way_pose[1] + left * wp.cos(way_pose[2]),
@@ -649,7 +661,8 @@ def yield_one(
                     ):
                         stops = bool(False)
                         if walk.status[b, j] == WalkStatus.CROSSING:
-                            stops = near > 0.0 or way - half < 0.3
+                            # who is on the crossing already leaves it, but for somebody right before it
+                            stops = near > -NOSE or way - body[1] < TOUCHES
                         elif form[3] > 0.5 or numbers[1] == 1:
                             stops = near > 0.3 and speed * speed < 2.0 * comfort * wp.max(near - 0.5, 0.1)
                         if stops:

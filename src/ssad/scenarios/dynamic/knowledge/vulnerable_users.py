@@ -106,7 +106,7 @@ class _Group:
 def draw_walkers(
     plan: TrafficPlan,
     graph: LaneGraph,
-    route: Route,
+    route: Route | None,
     others: Sequence[EpisodeAgent],
     duration: float,
     *key: object,
@@ -116,7 +116,7 @@ def draw_walkers(
     Args:
         plan: Number of walkers.
         graph: Lane graph of the town; without sidewalks near the route there are no walkers.
-        route: The ego's route.
+        route: The ego's route; None: they start anywhere in the town.
         others: Agents in whom nobody starts.
         duration: Time for which they walk, s.
         *key: Key of the draw.
@@ -128,12 +128,16 @@ def draw_walkers(
 
     if plan.walkers == 0:
         return []
-    network, candidates = sidewalk_network(graph), _edges_near(graph, route)
+    network = sidewalk_network(graph)
+    if route is None:
+        candidates = tuple(index for index, edge in enumerate(network.edges) if edge.lane >= 0)
+    else:
+        candidates = _edges_near(graph, route)
     if not candidates:
         return []
     random = generator("walkers", *key)
     lengths = np.array([network.edges[edge].length for edge in candidates])
-    points = _sparse(route)
+    points = _sparse(route) if route is not None else None
     starts: list[F64] = []
     agents: list[EpisodeAgent] = []
     for _ in range(_ATTEMPTS * plan.walkers):
@@ -163,7 +167,7 @@ def draw_walkers(
             )
             ways.append((walk, offset))
         start = ways[0][0].route.xy[0].astype(np.float64)
-        is_far = float(np.hypot(*(points - start).T).min()) > NEAR
+        is_far = points is not None and float(np.hypot(*(points - start).T).min()) > NEAR
         if is_far or any(math.dist(start, other) < START_GAP for other in starts):
             continue
         members = list(_members(graph, network, ways, group, len(agents)))
