@@ -384,6 +384,8 @@ def make_way(
                 other_speed = state.speed[b, other] * facing
                 is_walker = bank.kind[bank.model[e, other]] == AgentKind.WALKER
                 in_group = walkers.leader[e, other] == walkers.leader[e, j]
+                if not is_walker:
+                    width = width + 0.1
                 overlap = width + AIR - wp.abs(beside)
                 if ahead > 0.0 and overlap > 0.0:
                     slower = wish - other_speed > 0.1
@@ -485,9 +487,7 @@ def walk_one(
                 status = WalkStatus.CROSSING
                 crossing = number + 1
                 room = wp.max(walkers.form[number][0] - 0.4, style[1])
-                wish = speed_on_road(
-                    bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents
-                )
+                wish = speed_on_road(bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents)
             elif to_wait < NEAR_KERB * cruise:
                 crossing = number + 1
                 status = WalkStatus.WAITING
@@ -513,9 +513,7 @@ def walk_one(
                 if may_go:
                     signal = int(NO_SIGNAL)
                     if not follows:
-                        signal = crossing_signal(
-                            bank, roads, walkers, e, number, stage, progress, depth, cruise, time
-                        )
+                        signal = crossing_signal(bank, roads, walkers, e, number, stage, progress, depth, cruise, time)
                     if signal == GAPS:
                         has_right = 0
                     if signal != CLOSED:
