@@ -25,7 +25,17 @@ from matplotlib.path import Path as Path2D
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.types import Actor, AgentKind, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalState
+from ssad.core.types import (
+    Actor,
+    AgentKind,
+    Controller,
+    Episode,
+    EpisodeLimits,
+    EpisodeTrace,
+    Pose,
+    Scenario,
+    SignalState,
+)
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard.sensors import camera_of, lidar_of, radar_of
 from ssad.metrics import episode_metrics
