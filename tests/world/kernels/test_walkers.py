@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import pickle
 from dataclasses import replace
@@ -103,9 +104,7 @@ def walker(number: int = 1, *, x: float = AT, y: float = -2.45, walks: bool = Tr
         forward = bool(sidewalk_network(ZEBRA).crossings[0].xy[1, 1] > 0.0)
         crossings = (WalkCrossing(0, SOUTH - 0.7 - START, SOUTH - START, NORTH - START, forward),)
     walk = WalkStyle(crossings, **{"margin": 2.0, "room": 0.7, **style})
-    return EpisodeAgent(
-        f"walker {number}", "walker", Controller.SCRIPT, pose, 0.0, SPEED, route=route, walk=walk
-    )
+    return EpisodeAgent(f"walker {number}", "walker", Controller.SCRIPT, pose, 0.0, SPEED, route=route, walk=walk)
 
 
 def car(
@@ -325,7 +324,7 @@ def test_nobody_is_touched_and_nobody_is_stuck_in_a_town(crowd: Any) -> None:
 def test_walkers_stay_on_pavements_and_crossings(crowd: Any) -> None:
     built, steps, _ = crowd
     network = sidewalk_network(TOWN)
-    line = np.concatenate([np.linspace(a, b, 30) for edge in network.edges for a, b in zip(edge.xy, edge.xy[1:])])
+    line = np.concatenate([np.linspace(a, b, 30) for edge in network.edges for a, b in itertools.pairwise(edge.xy)])
     agents = [agent for agent, walking in enumerate(built.agents) if walking.walk]
     for step in steps[::100]:
         places: F64 = step["pose"][agents, :2].astype(np.float64)
@@ -340,7 +339,7 @@ def test_a_world_with_walkers_copies_and_a_scene_without_them_keeps_its_hash() -
         both.step()
         alone.step()
     assert both.hashes()[1] == alone.hashes()[0]
-    copy = pickle.loads(pickle.dumps(both))  # noqa: S301
+    copy = pickle.loads(pickle.dumps(both))
     saved = both.snapshot()
     for _ in range(20):
         both.step()

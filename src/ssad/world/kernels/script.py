@@ -593,10 +593,9 @@ def begin_all(
             remember(bank, roads, scripts, state, script, scene_index, condition, dt)
     for agent_index in range(agents):
         kind = bank.script[episode, agent_index][3]
-        if (
-            (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL)
-            and state.active[scene_index, agent_index] == Presence.AWAKE
-        ):
+        if (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL) and state.active[
+            scene_index, agent_index
+        ] == Presence.AWAKE:
             if begin_phases(bank, roads, scripts, state, script, scene_index, agent_index, dt) == 1:
                 begins = 1
     return begins
@@ -1038,10 +1037,9 @@ def run_scripts(
             begins = begin_all(bank, roads, scripts, state, script, scene_index, agents, dt)
     for agent_index in range(agents):
         kind = bank.script[episode, agent_index][3]
-        if (
-            (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL)
-            and state.active[scene_index, agent_index] == Presence.AWAKE
-        ):
+        if (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL) and state.active[
+            scene_index, agent_index
+        ] == Presence.AWAKE:
             run_one(bank, roads, scripts, state, script, scene_index, agent_index, dt)
 
 

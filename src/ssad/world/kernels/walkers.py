@@ -125,7 +125,7 @@ def crossing_signal(
 def vehicle_place(
     bank: EpisodeArrays, roads: Roads, state: State, walkers: Walkers, b: int, i: int, e: int, crossing: int
 ) -> wp.vec4:
-    """Locate a vehicle before or on a crossing: m from its front to the near edge, m until its rear has left it, y, turn.
+    """Locate a vehicle before or on a crossing: m from front to near edge, m until the rear has left it, y, turn.
 
     FAR: it does not come there. turn: 1 if it turns just before. A vehicle that has left its route, or has none, goes
     straight on.
@@ -249,7 +249,7 @@ def is_free(
     has_right: int,
     agents: int,
 ) -> bool:
-    """Return whether all vehicles let a walker enter the road; has_right: 1 if they must yield, 2 if turning ones must."""
+    """Return whether all vehicles let a walker enter the road; has_right: 1 they must yield, 2 turning ones must."""
     line = walkers.crossing[crossing]
     form = walkers.form[crossing]
     kerb = form[1]
@@ -302,7 +302,7 @@ def speed_on_road(
     cruise: float,
     agents: int,
 ) -> float:
-    """Return the speed that a walker on the road wants: it stops before a vehicle that does not, and hurries from it."""
+    """Return the speed that a walker on the road wants: it stops for a vehicle that does not, and hurries from it."""
     line = walkers.crossing[crossing]
     form = walkers.form[crossing]
     kerb = form[1]
@@ -490,9 +490,7 @@ def walk_one(
                 status = WalkStatus.CROSSING
                 crossing = number + 1
                 room = wp.max(walkers.form[number][0] - 0.4, style[1])
-                wish = speed_on_road(
-                    bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents
-                )
+                wish = speed_on_road(bank, roads, state, walkers, b, e, number, stage, progress, speed, wish, agents)
             elif to_wait < NEAR_KERB * cruise:
                 crossing = number + 1
                 status = WalkStatus.WAITING
@@ -518,9 +516,7 @@ def walk_one(
                 if may_go:
                     signal = int(NO_SIGNAL)
                     if not follows:
-                        signal = crossing_signal(
-                            bank, roads, walkers, e, number, stage, progress, depth, cruise, time
-                        )
+                        signal = crossing_signal(bank, roads, walkers, e, number, stage, progress, depth, cruise, time)
                     if signal == GAPS:
                         has_right = 0
                     if signal != CLOSED:
