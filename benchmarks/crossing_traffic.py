@@ -65,7 +65,7 @@ def schedule(route: Route, speed: float, target: float, step: float, *, accelera
     return np.stack([np.interp(places, index, column) for column in (*route.xy.T, yaw)], 1)
 
 
-def crosses(way: F64, size: F64, other: F64, other_size: F64, awake: Bool, step: float) -> bool:
+def crosses(way: F64, size: F64, other: F64, other_size: F64, *, awake: Bool, step: float) -> bool:
     """Return whether a body crosses the ego's way within 4 s of the ego.
 
     Args:
@@ -114,7 +114,7 @@ def scheduled_crossings(episode: Episode, step: float = 0.1) -> int:
         places = np.vstack([np.tile(pose, (start, 1)), drive])[: len(way)]
         places = np.vstack([places, np.tile(places[-1], (len(way) - len(places), 1))])
         bodies = [np.array([body.length, body.width]) for body in (agent_model(ego), agent_model(agent))]
-        count += crosses(way, bodies[0], places, bodies[1], np.arange(len(way)) >= start, step)
+        count += crosses(way, bodies[0], places, bodies[1], awake=np.arange(len(way)) >= start, step=step)
     return count
 
 
@@ -142,7 +142,7 @@ def crossings(episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph]) -> n
         vehicles = np.flatnonzero((kind[row] > AgentKind.NONE) & (kind[row] <= AgentKind.BICYCLE))
         for agent in vehicles[vehicles > 0].tolist():
             other, moves = where[: len(way), row, agent], there[: len(way), row, agent]
-            counts[row] += crosses(way, size[row, 0], other, size[row, agent], moves, world.dt)
+            counts[row] += crosses(way, size[row, 0], other, size[row, agent], awake=moves, step=world.dt)
     return counts
 
 

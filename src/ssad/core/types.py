@@ -18,10 +18,11 @@ import numpy.typing as npt
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+I8 = npt.NDArray[np.int8]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
-_DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
+_DTYPES = {"F32": np.float32, "F64": np.float64, "I8": np.int8, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
 
 
 def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
@@ -31,13 +32,21 @@ def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
         table: A dataclass with postponed annotations.
 
     Returns:
-        Name -> dtype of the constructor's fields annotated F32, F64, I32, U8 or Bool, in their order.
+        Name -> dtype of the constructor's fields annotated F32, F64, I8, I32, U8 or Bool, in their order.
     """
     return {
         table_field.name: np.dtype(_DTYPES[str(table_field.type)])
         for table_field in fields(table)
         if table_field.init and str(table_field.type) in _DTYPES
     }
+
+
+class TurnSignal(IntEnum):
+    """Turn signal that a vehicle shows."""
+
+    RIGHT = -1
+    NONE = 0
+    LEFT = 1
 
 
 class LaneType(IntEnum):
@@ -777,6 +786,7 @@ class EpisodeTrace:
         route: The ego's route [N, 2], m.
         end: Reason of the end (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
         heights: Heights of the agents, m; empty where all agents have the dimensions of their models.
+        turn_signal: `TurnSignal` of the agents [T, A]; [0, 0] in an episode without drivers of the population.
     """
 
     key: str
@@ -810,3 +820,4 @@ class EpisodeTrace:
     route: F32
     end: str
     heights: tuple[float, ...] = ()
+    turn_signal: I8 = field(default_factory=lambda: np.zeros((0, 0), np.int8))

@@ -43,10 +43,18 @@ _PROVING: dict[str, Any] = {
 }
 _PAPER: dict[str, Any] = {**_SETTING, "observation": "adversary", "action": "adversary", "reward": "adversary"}
 _PPO: dict[str, Any] = {"lr": 3e-4, "noise": 0.6, "entropy": 0.002}
+_LONG: dict[str, Any] = {
+    "lr": 5e-4,
+    "noise": 0.4,
+    "entropy": 0.002,
+    "rollout": 64,
+    "steps": 2_000_000,
+    "validate": 250_000,
+}
 ADVERSARIES = {
-    "adv-ppo": replace(POLICY_RECIPES["ppo"], steps=1_000_000, **_PROVING, **_PPO, validate=250_000),
+    "adv-ppo": replace(POLICY_RECIPES["ppo"], **_PROVING, **_LONG),
     "adv-ppo-paper": replace(POLICY_RECIPES["ppo"], steps=200_000, **_PAPER, **_PPO, validate=50_000),
-    "frea": replace(POLICY_RECIPES["ppo"], steps=800_000, **_PROVING | {"reward": "lawful"}, **_PPO, validate=200_000),
+    "frea": replace(POLICY_RECIPES["ppo"], **_PROVING | {"reward": "lawful"}, **_LONG),
     "adv-sac": replace(POLICY_RECIPES["sac"], steps=100_000, **_PROVING, lr=3e-4, batch=256, validate=25_000),
     "adv-ddpg": replace(POLICY_RECIPES["td3"], algorithm="ddpg", steps=200_000, **_PROVING, batch=256, validate=50_000),
     "adv-dqn": replace(

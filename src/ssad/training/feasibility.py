@@ -2,10 +2,10 @@
 
 The region is the zero sublevel set of a value V of the ego's state: V <= 0 where some driving in the data keeps the ego
 clear of others, V > 0 where none does. It is learned without a simulator: twin critics Q regress to the discounted
-safety target (1 - gamma) h + gamma max(h, V'), where h = 18 while bodies touch and -1 otherwise, and V is a low
+safety target (1 - gamma) h + gamma max(h, V'), where h is positive while bodies touch and -1 otherwise, and V is a low
 expectile of the larger Q over the actions in the data. `ssad.training.feasible_ppo` uses V as a critic.
 
-Source: FREA (Chen et al. 2024, arXiv 2406.02983) for the state, h and the settings; its value is that of the largest
+Source: FREA (Chen et al. 2024, arXiv 2406.02983) for the state, h and most settings; its value is that of the largest
 feasible region of Zheng et al. (FISOR, ICLR 2024) after the discounted safety Bellman equation of Fisac et al. (2019).
 """
 
@@ -45,7 +45,6 @@ from ssad.world.world import World
 SHIPPED: Final = Path(__file__).parent / "weights" / "feasible-region.safetensors"
 STATE: Final = 18  # numbers of a state: x, y, length, width, heading and speed of the ego and of two others
 TOUCHING: Final = 0.1  # m between bodies up to which they count as touching
-UNSAFE: Final = 18.0  # h while they touch; -1 otherwise
 NO_ADVERSARY: Final = "none"
 ACTION: Final = 3  # throttle, brake, steer
 _RADIUS: Final = 25.0  # m within which others are part of the state
@@ -71,6 +70,9 @@ class RegionRecipe:
         hidden: Widths of the layers between.
         lr: Learning rate; falls to zero, evenly.
         gamma: Discount of a step.
+        unsafe: h while bodies touch. A state is infeasible where the discounted chance of a contact is above
+            1 / (1 + unsafe). FREA has 18; its adversaries hit less often, and in these drives that would make 94 % of
+            the states infeasible.
         expectile: Weight of a Q below V; that of one above is the rest to 1.
         tau: Share of the critics that their targets take over at each step.
         batch: Transitions of a gradient step.
@@ -85,6 +87,7 @@ class RegionRecipe:
     hidden: tuple[Whole, ...] = (64, 64)
     lr: Above = 3e-4
     gamma: Decay = 0.98
+    unsafe: Above = 2.0
     expectile: Part = 0.9
     tau: Part = 0.005
     batch: Whole = 1024
@@ -315,7 +318,7 @@ def train_region(
         torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: max(1.0 - step / recipe.steps, 0.0))
         for optimizer in optimizers
     ]
-    unsafe = np.where(body_distance(data.state) <= TOUCHING, UNSAFE, -1.0).astype(np.float32)
+    unsafe = np.where(body_distance(data.state) <= TOUCHING, recipe.unsafe, -1.0).astype(np.float32)
     columns = (data.state / _SCALE, data.action, data.next_state / _SCALE, unsafe, data.is_last.astype(np.float32))
     tensors = [torch.from_numpy(np.ascontiguousarray(column, np.float32)).to(device) for column in columns]
     chance = torch.Generator(device=device).manual_seed(recipe.seed)

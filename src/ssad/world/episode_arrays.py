@@ -12,12 +12,13 @@ import warp as wp
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import TURN, LaneGraph, Marking, SignKind
-from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
+from ssad.core.types import F32, I8, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, Scripts, TurnRank, Walkers, array_types
 from ssad.world.kernels.shared import BRIDGE
 from ssad.world.models import GRAVITY, agent_model, lateral_grip
 from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.scripts import ScriptTables
+from ssad.world.turn_signals import turn_sides
 from ssad.world.walkers import build_walkers, has_walkers
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
@@ -349,6 +350,7 @@ class Bank:
         script_rows: Rows of phases and words of history that the widest episode needs; (0, 0): no agent is scripted.
         script_sizes: [E, 2] The same for each episode.
         tables: The same routes for the host.
+        turn: `TurnSignal` [R] of the turn at the next junction of each route point.
         agents: A, slots per scene.
         kind: [E, A] AgentKind of every slot.
         size: [E, A, 2] length and width, m.
@@ -365,6 +367,7 @@ class Bank:
     script_rows: tuple[int, int]
     script_sizes: npt.NDArray[np.int32]
     tables: RoadTables
+    turn: I8
     agents: int
     kind: npt.NDArray[np.int32]
     size: F32
@@ -471,6 +474,9 @@ def build(  # noqa: PLR0917
         scripts.sizes,
         scripts.episode_sizes,
         tables,
+        np.concatenate(
+            [turn_sides(table.rule[:, 3], left_hand=bool(graphs[table.town].left_hand[0])) for table in pool.tables]
+        ),
         agent_count,
         np.where(
             model_indices < 0, int(AgentKind.NONE), np.asarray(arrays["kind"])[np.maximum(model_indices, 0)]

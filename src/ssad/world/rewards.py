@@ -289,7 +289,7 @@ def proving(
 ) -> F64:
     """Return the reward of adversaries that seek proven collisions, [N]; see `ssad.metrics.proven_collisions`.
 
-    A contact with the ego is paid with 30 if it proves something, and costs 10 if not. On the way there, a metre
+    A contact with the ego is paid with 30 if it proves something, and costs 3 if not. On the way there, a metre
     nearer to the goal brings 0.3; the goal itself brings nothing. A contact with anybody else costs 15, as in
     `adversary`.
 
@@ -303,7 +303,7 @@ def proving(
         against: As of `unlawful_cost`.
     """
     progress = np.clip(previous_cost - distance_to_goal(state, agents), -1.0, 1.0)
-    contact = np.where(hit_ego(state, agents), np.where(proven, 30.0, -10.0), 0.0)
+    contact = np.where(hit_ego(state, agents), np.where(proven, 30.0, -3.0), 0.0)
     cost = unlawful_cost(state, agents, alignment, off_road=off_road, against=against)
     reward: F64 = 0.3 * progress - 15.0 * hit_others(state, agents) + contact - cost
     return reward

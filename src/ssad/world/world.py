@@ -17,7 +17,7 @@ from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
-from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
+from ssad.core.types import F32, I8, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
 from ssad.world.belief import Lanes, check, complete_belief, lanes_of, rest_times
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import fill_all_rows
@@ -43,6 +43,7 @@ from ssad.world.kernels.traffic import react_to_agents, scan_all_agents
 from ssad.world.kernels.walkers import restart_walks, walk_all, yield_to_walkers
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
+from ssad.world.turn_signals import turn_signals
 
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
@@ -712,6 +713,25 @@ class World:
             red_light=(self.array("ego.red_light") == 1).astype(np.uint8),
             stop_sign=self.array("ego.stop_sign").astype(np.uint8),
             note=self.array("note"),
+            turn_signals=self._turn_signals,
+        )
+
+    def _turn_signals(self) -> I8:
+        """Return `TurnSignal` [B, A]."""
+        constants = self._fixed
+        route, controller = constants["route"], self.array("controller")
+        point = route[..., 0] + self.array("progress")
+        return turn_signals(
+            shift=self.array("shift"),
+            along=self.array("aim")[..., 0],
+            speed=self.array("speed"),
+            junction_distance=self.bank.tables.rule[point, 2],
+            turn=self.bank.turn[point],
+            half_length=np.float32(0.5) * constants["size"][..., 0],
+            indicates=(controller == Controller.AUTOPILOT)
+            & (route[..., 1] > 1)
+            & (constants["kind"] != AgentKind.WALKER)
+            & (self.array("active") == Presence.AWAKE),
         )
 
     def _signals(self, time: npt.NDArray[np.float64]) -> U8:

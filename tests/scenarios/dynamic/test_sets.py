@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.quick import others_slow
 
 from benchmarks.crossing_traffic import crossings, schedule, scheduled_crossings
 from benchmarks.make_scenario_sets import (
@@ -159,9 +158,8 @@ def test_schedules_cross_where_and_when_their_ways_do() -> None:
         way = line_route(start, start + 200.0)
         xy = np.stack([np.full(len(way.xy), 50.0, np.float32), way.xy[:, 0]], 1)
         route = replace(way, xy=xy, yaw=np.full(len(xy), math.pi / 2, np.float32))
-        return EpisodeAgent(
-            "x", "car", Controller.AUTOPILOT, Pose(50.0, start, math.pi / 2), speed, 8.0, route=route, wake_distance=wake
-        )
+        pose = Pose(50.0, start, math.pi / 2)
+        return EpisodeAgent("x", "car", Controller.AUTOPILOT, pose, speed, 8.0, route=route, wake_distance=wake)
 
     def count(*others: EpisodeAgent) -> int:
         return scheduled_crossings(line_episode(ego(0.0, 0.0), *others))

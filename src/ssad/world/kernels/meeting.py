@@ -15,6 +15,7 @@ wp.set_module_options({"max_unroll": 0})  # see `traffic`
 ALIGNED = wp.constant(0.7)  # cosine of two headings that lead the same way
 SOON = wp.constant(0.5)  # s that a driver wants to come after another agent
 SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
+MOST_GAIN = wp.constant(2.5)  # m/s^2
 AIR = wp.constant(0.3)  # m before another body
 BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
 ASIDE_LIMIT = wp.constant(14.0)  # m beside the way, beyond which nobody's body reaches it
@@ -77,7 +78,7 @@ def find_meeting(
     own_body: wp.vec4,
     other_body: wp.vec2,
     margin: float,
-    before: float,
+    before: wp.vec2,
     other_accel: float,
     strides: int,
 ) -> Meeting:
@@ -85,7 +86,8 @@ def find_meeting(
 
     lon: metres that j is ahead in the driver's frame; motion: the driver's speed, acceleration and top speed if nobody
     is in its way, and s until it starts; margin: m to either side of the driver's body; before: s that the driver
-    wants to have left the stretch before j comes, which may go on to accelerate by `other_accel`; strides: how far
+    wants to have left the stretch before j comes, and s more for each metre to it; j
+    may go on to accelerate by `other_accel`; strides: how far
     ahead it looks.
     """
     meeting = Meeting()
@@ -156,11 +158,12 @@ def find_meeting(
             # past the near edge with j behind the middle, braking would only stay in its way
             if edge > 0.0 or along > 0.0:
                 rear = float(0.0)
-                sooner = gained_time(other_speed, other_accel, time)
+                sooner = gained_time(other_speed, wp.min(other_accel, MOST_GAIN), time)
+                reserve = before[0] + before[1] * wp.max(edge, 0.0)
                 if cosine > ALIGNED:
-                    rear = travel_distance(motion, sooner) - before * other_speed
+                    rear = travel_distance(motion, sooner) - reserve * other_speed
                 else:
-                    rear = travel_distance(motion, sooner - before)
+                    rear = travel_distance(motion, sooner - reserve)
                 if meeting.near < FAR or (rear < exit and travel_distance(motion, time + SOON) > edge):
                     if meeting.near >= FAR:
                         meeting.begin = entered
@@ -171,9 +174,7 @@ def find_meeting(
                         meeting.gap = joined
         elif covers:
             if meeting.near < FAR:
-                meeting.end = time - STRIDE * wp.clamp(
-                    clearance / wp.max(clearance - last_clearance, 0.01), 0.0, 1.0
-                )
+                meeting.end = time - STRIDE * wp.clamp(clearance / wp.max(clearance - last_clearance, 0.01), 0.0, 1.0)
                 break
             joins = bool(False)
         covers = covered

@@ -76,17 +76,19 @@ MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
-PASSES = wp.constant(2.0)  # m/s of somebody who is about to pass a driver that stands
+PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
 SOON_THERE = wp.constant(3.0)  # s until then
 TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
 WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
 BACKS_TIME = wp.constant(2.0)  # s for which a driver expects somebody to go on backwards
+PARALLEL = wp.constant(0.9)  # cosine of two headings
 SLOW = wp.constant(5.0)  # m/s of somebody who starts
 STARTS = wp.constant(0.3)  # m/s^2 of it
 FURTHER = wp.constant(3)  # times the strides ahead that its path is looked along
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
 MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
+UNSURE = wp.constant(0.06)  # s/m: the further away, the more of it
 LEAST_MARGIN = wp.constant(0.3)  # s of it, of who has priority
 AFTERWARDS = wp.constant(0.3)  # s between somebody who was let pass and the driver
 COVERED = wp.constant(0.05)  # s: sooner, the other one is in the way already
@@ -716,12 +718,14 @@ def meet_driver(
     motion = wp.vec4(speed, PICKS_UP_SHARE * driver_power(speed, style), top_speed, start)
     rule = row(roads.rule, route[0] + place)
     extra = looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
-    before = float(LEAST_MARGIN)
+    before = wp.vec2(LEAST_MARGIN, 0.0)
     other_accel = float(0.0)
-    if not goes_first:
-        before = MARGIN
-        if j < agents:
-            other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
+    if j < agents:
+        other_accel = state.accel[b, j]
+    if goes_first:
+        other_accel = wp.min(other_accel, 0.0)
+    else:
+        before = wp.vec2(MARGIN, UNSURE)
         if other_accel > STARTS and perceived.speed[b, j] < SLOW:
             extra = FURTHER * extra
     return find_meeting(
@@ -778,6 +782,8 @@ def driver_gives_way(
     stop = early_react(driver_yields(speed, meeting.near, style), driver_yields(speed, early, style), speed, style)
     comes_after = driver_arrives_after(speed, meeting.near, meeting.end + AFTERWARDS, style)
     react = wp.max(stop, comes_after)
+    if speed * meeting.end < meeting.near:
+        react = wp.max(react, -style[3] - power)  # it has passed by then in any case
     stops = (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES)
     stands = other_speed < WAITING and other_accel < STARTS
     if goes_first and ((stops and other_need < STILL_STOPS) or (stands and other_need < RELIES)):
@@ -785,11 +791,12 @@ def driver_gives_way(
     if meeting.joins == 1 and perceived.kind[b, j] != AgentKind.WALKER:
         follows = wp.max(driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - power)
         lead = meeting.gap + bank.body[bank.model[e, i]][0] + perceived.half[b, j][0]
-        if line <= -1.0 or is_there or wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > 0.8:
+        parallel = wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > PARALLEL
+        if line <= -1.0 or is_there or parallel:
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            if is_there or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            if is_there or parallel or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
