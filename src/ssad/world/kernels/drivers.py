@@ -106,7 +106,7 @@ def early_distance(distance: float, own_speed: float, accel: float, jerk: float,
 
 @wp.func
 def early_react(react: float, early: float, own_speed: float, style: wp.vec4) -> float:
-    """Return the reaction `early` to an earlier place, with no more than `EARLY` where `react` to the place asks less."""
+    """Return the reaction `early` to an earlier place, at most `EARLY` strong where `react` to the place asks less."""
     return wp.max(early, wp.min(react, -EARLY * style[3] - driver_power(own_speed, style)))
 
 
@@ -116,14 +116,15 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
     power = driver_power(own_speed, style)
-    allowed = power - (power + style[3]) * share * share
+    allowed = power - (power + style[3]) * share
     if share > 1.0:
         late = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
         if own_speed < CREEPS:
             late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
-        allowed = wp.min(allowed, -0.2 * style[3])
+        # the nearer, the firmer it holds
+        allowed = wp.min(allowed, -(0.8 - 0.6 * gap / (YIELD_GAP + 0.5)) * style[3])
     return allowed - power
 
 
