@@ -103,6 +103,7 @@ STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in th
 JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
 ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
 AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -811,8 +812,10 @@ def driver_gives_way(
             return wp.max(follows, -style[3] - power)
         elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and other_need < RELIES:
+    if goes_first and other_need < WARY:
         return 0.0  # the other one can stop
+    if goes_first and other_need < RELIES:
+        return -power  # it should, but who knows: the driver gains no speed
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
         return 0.0  # most of the stretch lies behind
