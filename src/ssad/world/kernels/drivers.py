@@ -61,18 +61,27 @@ def driver_power(own_speed: float, style: wp.vec4) -> float:
 
 
 @wp.func
+def follow_need(own_speed: float, leader_speed: float, room: float) -> float:
+    """Return the deceleration that keeps a driver from using up its room, also if its leader brakes."""
+    slower = wp.max(own_speed - leader_speed, 0.0)
+    least_room = wp.max(room, 0.2)
+    return wp.max(
+        slower * slower / (2.0 * least_room),
+        own_speed * own_speed / (2.0 * (least_room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
+    )
+
+
+@wp.func
 def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a leader `gap` metres ahead that drives at `leader_speed` m/s."""
     closing = own_speed * (own_speed - leader_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, own_speed * style[0] + closing)) / wp.max(gap, 0.1)
     power = driver_power(own_speed, style)
     wish = power * (1.0 - ratio * ratio)
-    room = wp.max(gap - LAST_GAP, 0.2)
-    slower = wp.max(own_speed - leader_speed, 0.0)
-    need = wp.max(
-        slower * slower / (2.0 * room),
-        own_speed * own_speed / (2.0 * (room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
-    )
+    need = follow_need(own_speed, leader_speed, gap - 0.8 * style[1])
+    if need > FIRM:
+        # who is late stops nearer to the leader
+        need = wp.max(FIRM, follow_need(own_speed, leader_speed, gap - LAST_GAP))
     return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - power
 
 
