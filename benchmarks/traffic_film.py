@@ -33,13 +33,12 @@ from ssad.core.top_view import BODY, EDGE, GROUND, LAMP, ROAD, SIDEWALK, VEHICLE
 from ssad.core.types import AgentKind, Episode, LaneType, Route, SignalState, TrafficPlan
 from ssad.report.video import save_frames
 from ssad.scenarios.dynamic.knowledge.vulnerable_users import draw_cyclists, draw_walkers
-from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence, TurnRank
+from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence
 from ssad.world.roads import load_town
 from ssad.world.world import VERSION, World
 
 ROUTES = 200  # of a town, from which each vehicle takes one
 LENGTH = 9000.0  # m of a route: nobody arrives
-ANNOUNCES = 30.0  # m before a junction from which a vehicle shows where it turns
 BRAKES = 0.4  # m/s^2 from which the brake lights are on
 AREA = 30.0  # m around the middle of a junction within which vehicles count for it
 VIEWS = 4  # junctions of a film
@@ -149,17 +148,12 @@ def _observed(world: World) -> dict[str, Any]:
     beyond = pose[..., :2] - path[..., :2]
     offset = beyond[..., 0] * np.cos(path[..., 2]) + beyond[..., 1] * np.sin(path[..., 2])
     leader = world.work.leader.numpy()
-    shift, along = world.array("shift"), world.array("aim")[..., 0]
-    changing = np.sign(shift[..., 3] - shift[..., 2]) * (along < shift[..., 1])
-    rank = np.mod(rule[..., 3], TurnRank.YIELD)
-    turning = np.where(rank == TurnRank.LEFT, 1, np.where(rank == TurnRank.RIGHT, -1, 0))
-    turning = np.where((rule[..., 2] < ANNOUNCES) & (route[..., 1] > 1), turning, 0)
     return {
         "pose": pose,
         "speed": state.speed.copy(),
         "acceleration": state.accel.copy(),
         "present": world.array("active") != Presence.ABSENT,
-        "turn": np.where(changing != 0, changing, turning).astype(np.int8),
+        "turn": state.turn_signal.astype(np.int8),
         "gap": np.where(leader == NO_LEADER, np.inf, 0.01 * (leader // LEADERS)).astype(np.float32),
         "leader": np.where(leader == NO_LEADER, -1, leader % LEADERS).astype(np.int32),
         "line": (np.minimum(rule[..., 1], rule[..., 2]) - offset - half).astype(np.float32),
