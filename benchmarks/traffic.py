@@ -45,8 +45,8 @@ from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.scenarios.dynamic.knowledge.vulnerable_users import (
     EDGE,
     MAX_SPEED_LIMIT,
-    cyclist,
     cycling_route,
+    cyclist,
     draw_walkers,
 )
 from ssad.world.episode_arrays import signal_programs

@@ -22,11 +22,13 @@ from ssad.world.kernels.drivers import (
     FIRM,
     HARDEST,
     NOTICES,
+    RELAXES,
     delay,
     driver_accelerates,
     driver_power,
     is_lapsed,
     lane_place,
+    looks_at_crossing,
     pedal_change,
 )
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
@@ -105,7 +107,11 @@ def driven_acceleration(
     pending = state.pending[b, i][0]
     # predictions flicker from step to step: a driver sees them as one
     reaction = state.pending[b, i][1]
-    reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
+    asked = wp.max(state.react[b, i], -HARDEST)
+    if asked < reaction:
+        reaction = reaction + NOTICES * (asked - reaction)
+    elif looks_at_crossing(state, b, i):
+        reaction = reaction + RELAXES * (asked - reaction)
     demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), driver_power(speed, style) + reaction)
     junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:

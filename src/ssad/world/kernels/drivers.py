@@ -9,7 +9,7 @@ section 11.3.4), and brakes no harder than the situation needs. Before a stop th
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Roads
+from ssad.world.kernels.data import FAR, Roads, State
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -18,10 +18,13 @@ STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Ro
 RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
 SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
 FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
-HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
+RELEASE = wp.constant(1.8)  # times the ordinary jerk, with which the foot leaves the throttle to brake
+HASTE = wp.constant(1.5)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
 ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
 PREPARED = wp.constant(40.0)  # m before a junction from which a driver is ready to brake
 NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
+LOOKS_EVERY = wp.constant(3)  # steps after which a driver looks at crossing traffic again
+RELAXES = wp.constant(0.8)  # share of it, where a driver that looks finds that less is demanded
 HARDEST = wp.constant(9.0)  # m/s^2
 CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
@@ -40,6 +43,12 @@ DRIFT = wp.constant(20.0)  # s over which the judgement of gaps changes
 LAPSE = wp.constant(2.0)  # s of an error
 SWERVE = wp.constant(6.0)  # s over which the place in the lane changes
 WANDER = wp.constant(0.05)  # m of it
+
+
+@wp.func
+def looks_at_crossing(state: State, b: int, i: int) -> bool:
+    """Return whether a driver looks at crossing traffic in this step: every `LOOKS_EVERY` steps, not all at once."""
+    return (state.step[b] + i) % LOOKS_EVERY == 0
 
 
 @wp.func
@@ -210,4 +219,6 @@ def delay(reaction_time: float, speed: float, junction: float) -> float:
 def pedal_change(demand: float, accel: float, jerk: float, time_step: float) -> float:
     """Return the acceleration to which a driver comes in a step, from `accel` towards `demand`."""
     down = jerk * wp.clamp(-demand / HASTE, 1.0, 6.0)
+    if accel > 0.0 and demand < 0.0:
+        down = wp.max(down, RELEASE * jerk)
     return wp.clamp(demand, accel - down * time_step, accel + jerk * time_step)
