@@ -74,6 +74,8 @@ SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per sq
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
+JAMMED = wp.constant(45.0)  # s after which a driver makes room behind somebody who stands in a junction
+CLOSED_UP = wp.constant(3.0)  # m
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
@@ -979,6 +981,14 @@ def react_to_agents(
                         state.stalled[b, i] = 1
                     elif not room_behind(perceived, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
+                if (
+                    style[0] > 0.0
+                    and leads == 1
+                    and leader[0] < CLOSED_UP
+                    and wp.min(state.waited[b, i], perceived.waited[b, j]) > JAMMED
+                    and perceived.way[b, j][1] < other_half[0] + 0.5
+                ):
+                    state.stalled[b, i] = 1  # makes room for somebody who may have to back out of the junction
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
                 # a driver of the population does not brake hard for it
