@@ -810,7 +810,8 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            if is_there or parallel or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            is_ahead = lead < -JOINS and goes_first
+            if is_there or parallel or is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
@@ -825,8 +826,8 @@ def driver_gives_way(
         react = wp.min(react, -power - HOLDS)  # it does not start only to stop again
     if meeting.near < ENTERED and speed > LETS_BELOW and not is_there:
         # in the stretch already, it goes on if it leaves it in time
-        sooner = meeting.begin - LEAST_MARGIN
-        if wp.min(speed * sooner + 0.4 * power * sooner * sooner, state.aim[b, i][1] * sooner) > meeting.far:
+        sooner = meeting.begin
+        if wp.min(speed * sooner + 0.5 * power * sooner * sooner, state.aim[b, i][1] * sooner) > meeting.far:
             return 0.0
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
