@@ -5,7 +5,7 @@ busiest junctions side by side: lanes, stop lines in the colour of their signal,
 and the speed of each agent, and the clock. The recorded drive lies beside the film (`TOWN.npz`) and is used again:
 `--at X,Y` shows another place, `--agent N` goes with an agent, `--whole` shows the town, `--begin S --end S` take a
 part, and `--sheet S` writes pictures S seconds apart on one sheet instead of a film. The command prints what is worth a
-look: contacts, bodies that nearly touch, hard braking, vehicles that stand although nothing holds them.
+look: contacts, bodies that nearly touch, hard braking, starts on red, vehicles that stand although nothing holds them.
 """
 
 from __future__ import annotations
@@ -30,16 +30,15 @@ from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips
 from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import atomic_path, load_npz, save_npz
 from ssad.core.top_view import BODY, EDGE, GROUND, LAMP, ROAD, SIDEWALK, VEHICLE, Frame
-from ssad.core.types import AgentKind, Episode, LaneType, Route, TrafficPlan
+from ssad.core.types import AgentKind, Episode, LaneType, Route, SignalState, TrafficPlan
 from ssad.report.video import save_frames
 from ssad.scenarios.dynamic.knowledge.vulnerable_users import draw_cyclists, draw_walkers
-from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence, TurnRank
+from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence
 from ssad.world.roads import load_town
 from ssad.world.world import VERSION, World
 
 ROUTES = 200  # of a town, from which each vehicle takes one
 LENGTH = 9000.0  # m of a route: nobody arrives
-ANNOUNCES = 30.0  # m before a junction from which a vehicle shows where it turns
 BRAKES = 0.4  # m/s^2 from which the brake lights are on
 AREA = 30.0  # m around the middle of a junction within which vehicles count for it
 VIEWS = 4  # junctions of a film
@@ -48,6 +47,8 @@ VIEW_WIDTH = 100.0  # m that a view shows from left to right
 HARD = 4.0  # m/s^2 of braking worth a look
 NEAR = 0.3  # m between two bodies worth a look
 IDLE = 15.0  # s at rest worth a look, if no signal, leader or junction explains them
+PAST_LINE = 2.5  # m beyond its stop line at which the front of a vehicle has left its place
+LATE = 1.5  # s of red after which nobody who came at yellow is left
 OPEN = 20.0  # m to the next leader or line, from which nothing holds a vehicle
 BRAKE_LIGHT, TURN_LIGHT, CLOCK = (255, 40, 40), (255, 214, 0), (30, 41, 59)
 CROSSWALK, ROUND = (214, 214, 206), 4  # OpenCV draws at 1/16 pixel
@@ -147,17 +148,12 @@ def _observed(world: World) -> dict[str, Any]:
     beyond = pose[..., :2] - path[..., :2]
     offset = beyond[..., 0] * np.cos(path[..., 2]) + beyond[..., 1] * np.sin(path[..., 2])
     leader = world.work.leader.numpy()
-    shift, along = world.array("shift"), world.array("aim")[..., 0]
-    changing = np.sign(shift[..., 3] - shift[..., 2]) * (along < shift[..., 1])
-    rank = np.mod(rule[..., 3], TurnRank.YIELD)
-    turning = np.where(rank == TurnRank.LEFT, 1, np.where(rank == TurnRank.RIGHT, -1, 0))
-    turning = np.where((rule[..., 2] < ANNOUNCES) & (route[..., 1] > 1), turning, 0)
     return {
         "pose": pose,
         "speed": state.speed.copy(),
         "acceleration": state.accel.copy(),
         "present": world.array("active") != Presence.ABSENT,
-        "turn": np.where(changing != 0, changing, turning).astype(np.int8),
+        "turn": state.turn_signal.astype(np.int8),
         "gap": np.where(leader == NO_LEADER, np.inf, 0.01 * (leader // LEADERS)).astype(np.float32),
         "leader": np.where(leader == NO_LEADER, -1, leader % LEADERS).astype(np.int32),
         "line": (np.minimum(rule[..., 1], rule[..., 2]) - offset - half).astype(np.float32),
@@ -224,17 +220,11 @@ class View:
         return self.image
 
     def _stop_lines(self, states: Ints) -> None:
-        graph = self.graph
-        for signal, lane, s in zip(graph.stop_signal, graph.stop_lane, graph.stop_s, strict=True):
+        for signal, x, y, yaw, half in _stop_lines(self.graph):
             colour = LAMP.get(int(states[signal]))
-            if colour is None:
-                continue
-            points = graph.points(int(lane))
-            x, y = (float(np.interp(s, graph.s[points], graph.xy[points, axis])) for axis in (0, 1))
-            yaw = float(np.interp(s, graph.s[points], np.unwrap(graph.yaw[points])))
-            half = 0.45 * float(np.interp(s, graph.s[points], graph.width[points]))
-            side = half * np.array([-math.sin(yaw), math.cos(yaw)])
-            self._line([np.array([x, y]) - side, np.array([x, y]) + side], colour, 4)
+            if colour is not None:
+                side = half * np.array([-math.sin(yaw), math.cos(yaw)])
+                self._line([np.array([x, y]) - side, np.array([x, y]) + side], colour, 4)
 
     def _agent(self, drive: Drive, step: int, agent: int) -> None:
         x, y, yaw = (float(value) for value in drive.pose[step, agent])
@@ -286,7 +276,7 @@ def frames(views: Sequence[View], drive: Drive, steps: Sequence[int], agent: int
         yield np.concatenate(rows, axis=0)
 
 
-def remarks(drive: Drive) -> list[tuple[float, str]]:
+def remarks(graph: LaneGraph, drive: Drive) -> list[tuple[float, str]]:
     """Return what is worth a look after the settling time: time in s, and agents, places and values in one line."""
     lines: list[tuple[float, str]] = []
     dt, steps = float(drive.dt[0]), len(drive.speed)
@@ -314,7 +304,38 @@ def remarks(drive: Drive) -> list[tuple[float, str]]:
     _spells(waits, dt, lambda step, agent, s: tell(step, agent, f"stands for {s:.0f} s") if s > 60.0 else None)
     off = moves & drive.present & (drive.lane < 0)
     _spells(off, dt, lambda step, agent, s: tell(step, agent, f"off the lanes for {s:.1f} s"), 0.5)
+    for step, agent, red in _red_starts(graph, drive):
+        tell(step, agent, f"passes its stop line {red:.1f} s after red began")
     return sorted(line for line in lines if line[0] > SETTLE)
+
+
+def _red_starts(graph: LaneGraph, drive: Drive) -> Iterator[tuple[int, int, float]]:
+    """Yield step, agent and s of red where somebody drives over a stop line on red, but for turns to the near side."""
+    forward = np.stack([np.cos(drive.pose[..., 2]), np.sin(drive.pose[..., 2])], axis=-1)
+    front = drive.pose[..., :2] + 0.5 * drive.size[:, 0, None] * forward
+    near_side = 1 if graph.left_hand[0] else -1
+    able = drive.present & (drive.kind != AgentKind.WALKER) & (drive.turn != near_side)
+    for signal, x, y, yaw, half in _stop_lines(graph):
+        along = np.array([math.cos(yaw), math.sin(yaw)])
+        offset = front - np.array([x, y])
+        beyond, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+        on_lane = able & (np.abs(aside) < half) & (forward @ along > 0.8)
+        passed = on_lane[1:] & on_lane[:-1] & (beyond[:-1] < PAST_LINE) & (beyond[1:] >= PAST_LINE)
+        red = drive.signal[:, signal] == SignalState.RED
+        for step, agent in np.argwhere(passed & red[1:, None]).tolist():
+            other = np.flatnonzero(~red[: step + 1])
+            seconds = float(drive.dt[0]) * (step + 1 - (int(other[-1]) if len(other) else 0))
+            if seconds > LATE:
+                yield step + 1, agent, seconds
+
+
+def _stop_lines(graph: LaneGraph) -> Iterator[tuple[int, float, float, float, float]]:
+    """Yield signal, x, y, yaw and half width, in m and rad, of each stop line."""
+    for signal, lane, s in zip(graph.stop_signal, graph.stop_lane, graph.stop_s, strict=True):
+        points = graph.points(int(lane))
+        x, y = (float(np.interp(s, graph.s[points], graph.xy[points, axis])) for axis in (0, 1))
+        yaw = float(np.interp(s, graph.s[points], np.unwrap(graph.yaw[points])))
+        yield int(signal), x, y, yaw, 0.45 * float(np.interp(s, graph.s[points], graph.width[points]))
 
 
 def _near_pairs(drive: Drive, step: int) -> Iterator[tuple[int, int]]:
@@ -380,7 +401,7 @@ def main() -> None:
     graph = load_town(given.town)
     drive, is_new = recorded(graph, given)
     if is_new:
-        for time, line in remarks(drive):
+        for time, line in remarks(graph, drive):
             print(f"{time:6.1f} s  {line}")
     name, views = views_of(graph, drive, given)
     dt, steps = float(drive.dt[0]), len(drive.speed)

@@ -71,7 +71,7 @@ def changed(name: str, steps: slice, value: float) -> dict[str, object]:
     ],
 )
 def test_what_is_worth_a_look_is_told_with_its_time(changes: dict[str, object], texts: list[tuple[float, str]]) -> None:
-    told = remarks(still_drive(**changes))
+    told = remarks(load_town("Twinford"), still_drive(**changes))
     assert [time for time, _ in told] == pytest.approx([time for time, _ in texts])
     for (_, line), (_, text) in zip(told, texts, strict=True):
         assert line.startswith("0 (car 0) at (122, 45): ")
@@ -83,11 +83,29 @@ def test_bodies_that_nearly_touch_are_told_once() -> None:
     pose, speed = drive.pose.copy(), drive.speed.copy()
     pose[200:250, 1, :2] = (122.0 + 0.95 + 0.25 + 0.1, 45.0)  # 0.1 m beside the car
     speed[200:250, 1] = 1.0
-    told = remarks(replace(drive, pose=pose, speed=speed))
+    told = remarks(load_town("Twinford"), replace(drive, pose=pose, speed=speed))
     assert [line for time, line in told if time == pytest.approx(20.1)] == [
         "0 (car 0) at (122, 45): 0.10 m from 1 (walker 1), 0.0 and 1.0 m/s"
     ]
     assert len(told) == 1
+
+
+@pytest.mark.parametrize(("turn", "state", "is_told"), [(0, "RED", True), (-1, "RED", False), (0, "GREEN", False)])
+def test_a_start_on_red_is_told_unless_it_turns_to_the_near_side(turn: int, state: str, is_told: bool) -> None:
+    graph, drive = load_town("Twinford"), still_drive()
+    lane, s, signal = int(graph.stop_lane[0]), float(graph.stop_s[0]), int(graph.stop_signal[0])
+    points = graph.points(lane)
+    x, y = (float(np.interp(s, graph.s[points], graph.xy[points, axis])) for axis in (0, 1))
+    yaw = float(graph.yaw[points][-1])
+    pose = drive.pose.copy()
+    ahead = np.clip(0.1 * (np.arange(STEPS) - 200) + 0.03, 0.0, 8.0) - 0.5 * drive.size[0, 0]
+    pose[:, 0] = np.stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), np.full(STEPS, yaw)], axis=1)
+    signals = np.full_like(drive.signal, SignalState[state])
+    signals[:100, signal] = SignalState.GREEN
+    told = remarks(graph, replace(drive, pose=pose, signal=signals, turn=np.full_like(drive.turn, turn)))
+    expected = [(22.6, "passes its stop line 12.6 s after red began")] * is_told
+    assert [time for time, _ in told] == pytest.approx([time for time, _ in expected])
+    assert all(text in line for (_, line), (_, text) in zip(told, expected, strict=True))
 
 
 def colours(image: np.ndarray) -> set[tuple[int, ...]]:

@@ -28,8 +28,8 @@ RELAXES = wp.constant(0.8)  # share of it, where a driver that looks finds that 
 HARDEST = wp.constant(9.0)  # m/s^2
 CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
-LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
-LAUNCH = wp.constant(0.4)  # share by which the acceleration from rest is larger
+LAST_GAP = wp.constant(1.0)  # m that also a driver who is late keeps to where it stops
+LAUNCH = wp.constant(0.6)  # share by which the acceleration from rest is larger
 LAUNCHED = wp.constant(8.0)  # m/s from which on it is the ordinary one
 EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which a driver begins to brake early
 LONGEST_WAIT = wp.constant(20.0)  # s
@@ -61,18 +61,27 @@ def driver_power(own_speed: float, style: wp.vec4) -> float:
 
 
 @wp.func
+def follow_need(own_speed: float, leader_speed: float, room: float) -> float:
+    """Return the deceleration that keeps a driver from using up its room, also if its leader brakes."""
+    slower = wp.max(own_speed - leader_speed, 0.0)
+    least_room = wp.max(room, 0.2)
+    return wp.max(
+        slower * slower / (2.0 * least_room),
+        own_speed * own_speed / (2.0 * (least_room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
+    )
+
+
+@wp.func
 def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a leader `gap` metres ahead that drives at `leader_speed` m/s."""
     closing = own_speed * (own_speed - leader_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, own_speed * style[0] + closing)) / wp.max(gap, 0.1)
     power = driver_power(own_speed, style)
     wish = power * (1.0 - ratio * ratio)
-    room = wp.max(gap - LAST_GAP, 0.2)
-    slower = wp.max(own_speed - leader_speed, 0.0)
-    need = wp.max(
-        slower * slower / (2.0 * room),
-        own_speed * own_speed / (2.0 * (room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
-    )
+    need = follow_need(own_speed, leader_speed, gap - 0.8 * style[1])
+    if need > FIRM:
+        # who is late stops nearer to the leader
+        need = wp.max(FIRM, follow_need(own_speed, leader_speed, gap - LAST_GAP))
     return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - power
 
 
@@ -106,7 +115,7 @@ def early_distance(distance: float, own_speed: float, accel: float, jerk: float,
 
 @wp.func
 def early_react(react: float, early: float, own_speed: float, style: wp.vec4) -> float:
-    """Return the reaction `early` to an earlier place, with no more than `EARLY` where `react` to the place asks less."""
+    """Return the reaction `early` to an earlier place, at most `EARLY` strong where `react` to the place asks less."""
     return wp.max(early, wp.min(react, -EARLY * style[3] - driver_power(own_speed, style)))
 
 
@@ -116,14 +125,15 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
     power = driver_power(own_speed, style)
-    allowed = power - (power + style[3]) * share * share
+    allowed = power - (power + style[3]) * share
     if share > 1.0:
         late = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
         if own_speed < CREEPS:
             late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
-        allowed = wp.min(allowed, -0.2 * style[3])
+        # the nearer, the firmer it holds
+        allowed = wp.min(allowed, -(0.8 - 0.6 * gap / (YIELD_GAP + 0.5)) * style[3])
     return allowed - power
 
 

@@ -9,6 +9,7 @@ import warp as wp
 
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, PerceivedAgents, Roads
 from ssad.world.kernels.lanes import way_frame
+from ssad.world.kernels.shared import wrap
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -16,11 +17,12 @@ ALIGNED = wp.constant(0.7)  # cosine of two headings that lead the same way
 SOON = wp.constant(0.5)  # s that a driver wants to come after another agent
 SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
 MOST_GAIN = wp.constant(2.5)  # m/s^2
-AIR = wp.constant(0.3)  # m before another body
+AIR = wp.constant(0.6)  # m before another body
 BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
 PROJECTIONS = wp.constant(3)  # Newton steps with which a place is located along the way
 LONG = wp.constant(3.0)  # m, half of a body that needs more room in bends
-MOST_SWING = wp.constant(1.5)  # m of it
+SWING = wp.constant(0.575)  # half of a wheelbase over half of a body
+MOST_SWING = wp.constant(2.0)  # m of it
 LOCATED = wp.constant(1.5)  # m that may be left of it
 STEEPEST = wp.constant(0.3)  # least share of a metre along the other side of a bend
 
@@ -75,6 +77,12 @@ def gained_time(speed: float, acceleration: float, time: float) -> float:
 
 
 @wp.func
+def swing_out(curvature: float, half_length: float) -> float:
+    """Return how far the front of a long body leads beside the path of its middle, m: by the slip of the bend."""
+    return wp.min(SWING * wp.abs(curvature) * half_length * half_length, MOST_SWING)
+
+
+@wp.func
 def find_meeting(
     roads: Roads,
     perceived: PerceivedAgents,
@@ -120,6 +128,7 @@ def find_meeting(
     along = wp.clamp(lon, -BEHIND, reach)
     frame = way_frame(roads, route[0], route[1], shift, u0 + along)
     last_clearance = float(0.0)
+    turned = float(0.0)
     time = float(0.0)
     covers = bool(False)
     entered = float(0.0)
@@ -133,6 +142,7 @@ def find_meeting(
             time = accelerating_time(other_speed, other_accel, forecast_speed * time)
         if place > 0:
             next_pose = forecast_pose(perceived, b, j, place - 1)
+            turned = wrap(next_pose[2] - pose[2])
             step = (next_pose[0] - pose[0]) * frame[2] + (next_pose[1] - pose[1]) * frame[3]
             along = wp.clamp(along + step, -BEHIND, reach)
             pose = next_pose
@@ -151,10 +161,12 @@ def find_meeting(
         clearance = wp.abs(lateral) - aside
         swing = float(0.0)
         if own_body[0] > LONG:
-            # the front of a long body swings out in bends
+            # the body lags in bends: the front of a long one swings out
             point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
-            swing = wp.min(0.5 * wp.abs(roads.path[point][3]) * (own_body[0] * own_body[0] - LONG * LONG), MOST_SWING)
-            clearance = clearance - swing
+            swing = swing_out(roads.path[point][3], own_body[0])
+        if other_body[0] > LONG and place > 0:
+            swing = swing + swing_out(turned / wp.max(STRIDE * forecast_speed, 0.5), other_body[0])
+        clearance = clearance - swing
         edge = float(0.0)
         exit = float(0.0)
         cosine = float(0.0)

@@ -78,7 +78,7 @@ LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which 
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
 PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
-SOON_THERE = wp.constant(4.0)  # s until then
+SOON_THERE = wp.constant(5.0)  # s until then
 LETS_BELOW = wp.constant(1.5)  # m/s of a driver that starts
 TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
 WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
@@ -103,6 +103,7 @@ STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in th
 JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
 ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
 AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -324,6 +325,19 @@ def arrives_first(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j:
 
 
 @wp.func
+def crosses_first(perceived: PerceivedAgents, b: int, i: int, j: int) -> bool:
+    """Return whether i is first at the crossing of their straight paths; an agent that brakes for j stays second."""
+    own_pose = perceived.pose[b, i]
+    other_pose = perceived.pose[b, j]
+    sine = wp.sin(other_pose[2] - own_pose[2])
+    dx = other_pose[0] - own_pose[0]
+    dy = other_pose[1] - own_pose[1]
+    far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
+    far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
+    return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+
+
+@wp.func
 def has_priority(
     bank: EpisodeArrays,
     roads: Roads,
@@ -361,17 +375,8 @@ def has_priority(
         return own_way[2] < other_way[2]
     if wp.abs(own_way[1] - other_way[1]) > 1.0:
         return own_way[1] < other_way[1]
-    if inside_i and inside_j:
-        own_pose = perceived.pose[b, i]
-        other_pose = perceived.pose[b, j]
-        sine = wp.sin(other_pose[2] - own_pose[2])
-        if wp.abs(sine) > 0.5:
-            # First at the crossing of their straight paths; an agent that brakes for the other stays second.
-            dx = other_pose[0] - own_pose[0]
-            dy = other_pose[1] - own_pose[1]
-            far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
-            far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
-            return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+    if inside_i and inside_j and wp.abs(wp.sin(perceived.pose[b, j][2] - perceived.pose[b, i][2])) > 0.5:
+        return crosses_first(perceived, b, i, j)
     return i < j
 
 
@@ -807,8 +812,10 @@ def driver_gives_way(
             return wp.max(follows, -style[3] - power)
         elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and other_need < RELIES:
+    if goes_first and other_need < WARY:
         return 0.0  # the other one can stop
+    if goes_first and other_need < RELIES:
+        return -power  # it should, but who knows: the driver gains no speed
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
         return 0.0  # most of the stretch lies behind

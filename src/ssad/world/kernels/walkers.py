@@ -269,6 +269,9 @@ def is_free(
                     if is_changing_lane(state.shift[b, i]):
                         half = half + BESIDE
                     way = stage[3] * (place[2] - kerb) - progress
+                    stood = state.waited[b, i]
+                    if state.active[b, i] == Presence.ASLEEP:
+                        stood = FAR  # parked
                     yields = int(0)
                     if has_right == 1 or (has_right == 2 and place[3] == 1.0):
                         yields = 1
@@ -276,7 +279,7 @@ def is_free(
                         place,
                         wp.max(state.speed[b, i], 0.0),
                         state.accel[b, i],
-                        state.waited[b, i],
+                        stood,
                         way - half,
                         way + half + depth,
                         walking_speed,

@@ -219,12 +219,12 @@ def test_natural_traffic_comes_to_any_map_as_far_as_there_is_room(
     graph = town(tmp_path, road(sections=section(left, right)))
     plan = TrafficPlan(minimum=2, wake_distance=0.0, drivers="population", walkers=4, cyclists=2)
     route = (Pose(10.0, -1.75, 0.0), Pose(90.0, -1.75, 0.0))
-    scenario = Scenario("own/0", "FreeDrive", graph.name, route, traffic=plan)
+    scenario = Scenario("own/0", "FreeDrive", "maps/own.xodr", route, traffic=plan)
     episode = build_episode(scenario, graph, seed=0)
     models = [agent.model for agent in episode.agents[1:]]
     assert models.count("walker") == walkers
     assert "bicycle" in models or not left
-    (trace,) = rollout(World([episode], {graph.name: graph}), Autopilot())
+    (trace,) = rollout(World([episode], {"maps/own.xodr": graph}), Autopilot())
     assert trace.end != "collision"
     assert trace.route_complete[-1] > 50.0
 
