@@ -7,7 +7,8 @@ of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs
 files hold (`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
 
 `--human` measures how much the traffic is like that of people: headways, gaps, speeds, braking, junctions, signals,
-lane changes, beside published figures. With `--page` it writes their tables and picture.
+lane changes, beside published figures. With `--page` it writes their tables and picture. With `--walkers` and
+`--cyclists` it measures them too: crossings, waits, vehicles that yield, times between walkers and vehicles.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.scenarios.dynamic.knowledge.vulnerable_users import (
     EDGE,
     MAX_SPEED_LIMIT,
-    cyclist,
     cycling_route,
+    cyclist,
     draw_walkers,
 )
 from ssad.world.episode_arrays import signal_programs
@@ -275,6 +276,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
     parser.add_argument("--scenes", type=int, default=128, help="at most so many side by side")
     parser.add_argument("--drivers", choices=("uniform", "population"), default="uniform")
+    parser.add_argument("--walkers", type=int, default=0, help="walkers in each scene, with --human")
+    parser.add_argument("--cyclists", type=int, default=0, help="cyclists in each scene, with --human")
     parser.add_argument("--signals", choices=("program", "green"), default="program")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
@@ -321,6 +324,8 @@ def compare_with_people(given: argparse.Namespace) -> None:
     from benchmarks.traffic_human import drive_town, load, show, write_page
 
     about = {"world": VERSION, "drivers": given.drivers, "vehicles": given.vehicles, "minutes": given.minutes}
+    if given.walkers or given.cyclists:
+        about |= {"walkers": given.walkers, "cyclists": given.cyclists}
     towns = load(given.json)["towns"] if given.json and given.json.is_file() else []
     measured = {town["town"] for town in towns}
     scenes = max(1, math.ceil(given.hours * 60.0 / (given.vehicles * given.minutes)))
@@ -331,7 +336,10 @@ def compare_with_people(given: argparse.Namespace) -> None:
         routes = town_routes(graph, ROUTES, LENGTH)
         keys = range(given.first, given.first + scenes)
         green = given.signals == "green"
-        episodes = [traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers) for k in keys]
+        people = {"walkers": given.walkers, "cyclists": given.cyclists, "seconds": 60.0 * given.minutes}
+        episodes = [
+            traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers, **people) for k in keys
+        ]
         size = min(given.scenes, RECORDED)
         batches = [episodes[first : first + size] for first in range(0, scenes, size)]
         towns.append(drive_town(graph, batches, seconds=60.0 * given.minutes, device=given.device))

@@ -20,7 +20,6 @@ from ssad.world.roads.sidewalks import sidewalk_network
 TAIL = 14.0  # m behind its middle that the rear of a vehicle may be on a crossing
 JUST_AFTER = 15.0  # m beyond a turn within which a crossing is one of the road that is entered
 EDGE = 1.0  # m beyond the kerb up to which a route leads over a crossing
-FIRST_ROW = 5.2  # m, half length of the longest body: from the middle of a vehicle to its front
 
 
 def has_walkers(episodes: Sequence[Episode]) -> bool:
@@ -28,7 +27,10 @@ def has_walkers(episodes: Sequence[Episode]) -> bool:
     return any(agent.walk is not None for episode in episodes for agent in episode.agents)
 
 
-def passings(path: F32, rule: F32, ends: F64, kerbs: F64, half_width: F64) -> list[tuple[float, float, float, int, int]]:
+Passing = tuple[float, float, float, int, int]
+
+
+def passings(path: F32, rule: F32, ends: F64, kerbs: F64, half_width: F64) -> list[Passing]:
     """Find where a route leads over crossings.
 
     Args:
@@ -100,17 +102,17 @@ class _Rows:
         lines = np.array([self.crossing[row] for row in rows])
         form = np.array([self.form[row] for row in rows])
         ends = np.stack([lines[:, :2], lines[:, :2] + lines[:, 2:]], 1)
-        found = passings(path, rule, ends, form[:, 1:3], form[:, 0])
+        route_passings = passings(path, rule, ends, form[:, 1:3], form[:, 0])
         first = len(self.passing)
         next_passing[:] = -1
-        for number, (low, high, place, crossing, turns) in reversed(list(enumerate(found))):
-            next_passing[: max(int(high + TAIL) + 1, 0)] = first + number
-        for number, (low, high, place, crossing, turns) in enumerate(found):
+        for number, passing in reversed(list(enumerate(route_passings))):
+            next_passing[: max(int(passing[1] + TAIL) + 1, 0)] = first + number
+        for number, (low, high, place, crossing, turns) in enumerate(route_passings):
             self.passing.append((low, high, place))
-            self.passing_crossing.append((rows[crossing], turns, int(number + 1 < len(found))))
+            self.passing_crossing.append((rows[crossing], turns, int(number + 1 < len(route_passings))))
 
 
-def build_walkers(
+def build_walkers(  # noqa: PLR0917
     episodes: Sequence[Episode],
     graphs: Mapping[str, LaneGraph],
     route: npt.NDArray[np.int32],

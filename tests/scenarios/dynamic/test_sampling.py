@@ -87,6 +87,7 @@ LATER |= {"all": (), "any": (), "gap": None}
 LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
 LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
 LATER |= {"elsewhere": "program", "driver": None, "drivers": "uniform", "errors": 0.0, "walkers": 0, "cyclists": 0}
+LATER |= {"walk": None}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 

@@ -278,9 +278,7 @@ class Walkers:
     depth: wp.array2d(dtype=wp.float32)  # [E, A] m from the leader of a group to the last one
     leader: wp.array2d(dtype=wp.int32)  # [E, A] agent that decides, itself where it is alone; -1: no walker
     stages: wp.array2d(dtype=wp.vec2i)  # [E, A] first row of `stage`, number of rows
-    stage: wp.array(
-        dtype=wp.vec4
-    )  # [W] m along the way to where it waits, to both kerbs, and 1 towards greater y or -1
+    stage: wp.array(dtype=wp.vec4)  # [W] m along the way to where it waits and to both kerbs, 1 (greater y) or -1
     stage_crossing: wp.array(dtype=wp.int32)  # [W] crossing
     crossing: wp.array(dtype=wp.vec4)  # [C] x, y of the first end, unit vector towards the second
     form: wp.array(dtype=wp.vec4)  # [C] half width m, y of both kerbs, 1 marked

@@ -125,7 +125,7 @@ def crossing_signal(
 def vehicle_place(
     bank: EpisodeArrays, roads: Roads, state: State, walkers: Walkers, b: int, i: int, e: int, crossing: int
 ) -> wp.vec4:
-    """Locate a vehicle before or on a crossing: m from its front to the near edge, m until its rear has left it, y, turn.
+    """Locate a vehicle before or on a crossing: m from front to near edge, m until the rear has left it, y, turn.
 
     FAR: it does not come there. turn: 1 if it turns just before. A vehicle that has left its route, or has none, goes
     straight on.
@@ -249,7 +249,7 @@ def is_free(
     has_right: int,
     agents: int,
 ) -> bool:
-    """Return whether all vehicles let a walker enter the road; has_right: 1 if they must yield, 2 if turning ones must."""
+    """Return whether all vehicles let a walker enter the road; has_right: 1 they must yield, 2 turning ones must."""
     line = walkers.crossing[crossing]
     form = walkers.form[crossing]
     kerb = form[1]
@@ -269,6 +269,9 @@ def is_free(
                     if is_changing_lane(state.shift[b, i]):
                         half = half + BESIDE
                     way = stage[3] * (place[2] - kerb) - progress
+                    stood = state.waited[b, i]
+                    if state.active[b, i] == Presence.ASLEEP:
+                        stood = FAR  # parked
                     yields = int(0)
                     if has_right == 1 or (has_right == 2 and place[3] == 1.0):
                         yields = 1
@@ -276,7 +279,7 @@ def is_free(
                         place,
                         wp.max(state.speed[b, i], 0.0),
                         state.accel[b, i],
-                        state.waited[b, i],
+                        stood,
                         way - half,
                         way + half + depth,
                         walking_speed,
@@ -302,7 +305,7 @@ def speed_on_road(
     cruise: float,
     agents: int,
 ) -> float:
-    """Return the speed that a walker on the road wants: it stops before a vehicle that does not, and hurries from it."""
+    """Return the speed that a walker on the road wants: it stops for a vehicle that does not, and hurries from it."""
     line = walkers.crossing[crossing]
     form = walkers.form[crossing]
     kerb = form[1]
@@ -360,10 +363,9 @@ def make_way(
     sine = wp.sin(way_yaw)
     own_half = bank.body[bank.model[e, j]]
     style = walkers.style[e, j]
-    low = -room - style[2]
-    high = room - style[2]
-    target = float(0.0)
-    greatest = float(0.0)
+    edges = wp.vec2(-room - style[2], room - style[2])
+    low = edges[0]
+    high = edges[1]
     limit = wish
     for other in range(agents):
         if other != j and state.active[b, other] != Presence.ABSENT:
@@ -386,22 +388,23 @@ def make_way(
                 in_group = walkers.leader[e, other] == walkers.leader[e, j]
                 if not is_walker:
                     width = width + 0.1
-                overlap = width + AIR - wp.abs(beside)
-                if ahead > 0.0 and overlap > 0.0:
-                    slower = wish - other_speed > 0.1
-                    crosses = is_walker and across > 0.8 and wp.abs(state.speed[b, other]) > 0.2
-                    if slower and not in_group and not crosses and overlap > greatest:
-                        # the nearer side, on the right if both are alike; the other one where there is no room
-                        side = float(-1.0)
-                        if beside < -0.05:
-                            side = 1.0
-                        place = left + side * overlap
-                        if place < low or place > high:
-                            opposite = left - side * (2.0 * (width + AIR) - overlap)
-                            if opposite >= low and opposite <= high:
-                                place = opposite
-                        target = wp.clamp(place, low, high)
-                        greatest = overlap
+                reach_across = width + AIR
+                crosses = is_walker and across > 0.8 and wp.abs(state.speed[b, other]) > 0.2
+                is_beside = gap < 0.0 and ahead > -half_along - own_half[0] - 0.1
+                is_slower = ahead > 0.0 and wish - other_speed > 0.1
+                if (is_beside or (is_slower and not in_group)) and not crosses:
+                    # on the right of whoever is not clearly on the right itself; on the other side if there is no room
+                    left_of_it = beside < -0.05
+                    if wp.abs(beside) < width:
+                        if left_of_it and left + beside + reach_across > edges[1]:
+                            left_of_it = bool(False)
+                        elif not left_of_it and left + beside - reach_across < edges[0]:
+                            left_of_it = left + beside + reach_across <= edges[1]
+                    if left_of_it:
+                        low = wp.max(low, left + beside + reach_across)
+                    else:
+                        high = wp.min(high, left + beside - reach_across)
+                if ahead > 0.0:
                     is_blocked = wp.abs(beside) < width - 0.02
                     if is_blocked and is_walker:
                         least = wp.min(wish, SQUEEZES)
@@ -418,7 +421,10 @@ def make_way(
                             limit = wp.min(limit, wp.max(follows, least))
                     elif is_blocked:
                         limit = wp.min(limit, wp.sqrt(SLOWS * wp.max(gap - 0.4, 0.0)))
-    return wp.vec2(target, limit)
+    place = wp.clamp(0.0, low, high)
+    if low > high:
+        place = 0.5 * (low + high)
+    return wp.vec2(wp.clamp(place, edges[0], edges[1]), limit)
 
 
 @wp.func

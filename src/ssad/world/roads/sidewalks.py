@@ -185,9 +185,7 @@ class SidewalkNetwork:
     def _next_edge(
         self, edge: int, node: int, random: np.random.Generator, crossing_share: float, closed: Collection[int]
     ) -> int:
-        onward = [
-            index for index in self.edges_at[node] if index != edge and self.edges[index].crossing not in closed
-        ]
+        onward = [index for index in self.edges_at[node] if index != edge and self.edges[index].crossing not in closed]
         if not onward:
             return edge
         takes_crossing = float(random.uniform()) < crossing_share
