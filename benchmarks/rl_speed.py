@@ -61,7 +61,7 @@ def train_adversary() -> dict[str, float]:
     """Adv.PPO from nothing, validation and final test included: time, and what its card says."""
     began, used = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        list(run_adversary_training(AdversaryPlan("adv-ppo", Path(folder))))
+        list(run_adversary_training(AdversaryPlan("adv-ppo-paper", Path(folder))))
         card, _ = load_card(Path(folder) / "adv-ppo.safetensors")
     return {"seconds": time.perf_counter() - began, "processor_s": time.process_time() - used, **card.metrics}
 

@@ -5,7 +5,7 @@ busiest junctions side by side: lanes, stop lines in the colour of their signal,
 and the speed of each agent, and the clock. The recorded drive lies beside the film (`TOWN.npz`) and is used again:
 `--at X,Y` shows another place, `--agent N` goes with an agent, `--whole` shows the town, `--begin S --end S` take a
 part, and `--sheet S` writes pictures S seconds apart on one sheet instead of a film. The command prints what is worth a
-look: contacts, bodies that nearly touch, hard braking, vehicles that stand although nothing holds them.
+look: contacts, bodies that nearly touch, hard braking, starts on red, vehicles that stand although nothing holds them.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from benchmarks.traffic import town_routes, traffic
+from benchmarks.traffic import SETTLE, town_routes, traffic
 from ssad.core.geometry import corners, obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips
 from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import atomic_path, load_npz, save_npz
 from ssad.core.top_view import BODY, EDGE, GROUND, LAMP, ROAD, SIDEWALK, VEHICLE, Frame
-from ssad.core.types import AgentKind, Episode, LaneType, Route, TrafficPlan
+from ssad.core.types import AgentKind, Episode, LaneType, Route, SignalState, TrafficPlan
 from ssad.report.video import save_frames
 from ssad.scenarios.dynamic.knowledge.vulnerable_users import draw_cyclists, draw_walkers
-from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence, TurnRank
+from ssad.world.kernels.data import LEADERS, NO_LEADER, Presence
 from ssad.world.roads import load_town
 from ssad.world.world import VERSION, World
 
 ROUTES = 200  # of a town, from which each vehicle takes one
 LENGTH = 9000.0  # m of a route: nobody arrives
-ANNOUNCES = 30.0  # m before a junction from which a vehicle shows where it turns
 BRAKES = 0.4  # m/s^2 from which the brake lights are on
 AREA = 30.0  # m around the middle of a junction within which vehicles count for it
 VIEWS = 4  # junctions of a film
@@ -48,6 +47,8 @@ VIEW_WIDTH = 100.0  # m that a view shows from left to right
 HARD = 4.0  # m/s^2 of braking worth a look
 NEAR = 0.3  # m between two bodies worth a look
 IDLE = 15.0  # s at rest worth a look, if no signal, leader or junction explains them
+PAST_LINE = 2.5  # m beyond its stop line at which the front of a vehicle has left its place
+LATE = 1.5  # s of red after which nobody who came at yellow is left
 OPEN = 20.0  # m to the next leader or line, from which nothing holds a vehicle
 BRAKE_LIGHT, TURN_LIGHT, CLOCK = (255, 40, 40), (255, 214, 0), (30, 41, 59)
 CROSSWALK, ROUND = (214, 214, 206), 4  # OpenCV draws at 1/16 pixel
@@ -107,63 +108,58 @@ def filmed_episode(graph: LaneGraph, given: argparse.Namespace) -> Episode:
     near = _joined([agent.route for agent in episode.agents[:4] if agent.route is not None])
     key = ("traffic film", graph.name, given.seed)
     cyclists = draw_cyclists(plan, graph, near, episode.agents, *key)
-    walkers = draw_walkers(plan, graph, near, 60.0 * given.minutes, *key)
+    standing = [*episode.agents, *cyclists]
+    walkers = draw_walkers(plan, graph, near, standing, 60.0 * given.minutes, *key)
     return replace(episode, agents=(*episode.agents, *cyclists, *walkers))
 
 
 def _joined(routes: Sequence[Route]) -> Route:
     """Return the first 1000 m of some routes, one after the other."""
-    parts = {name: np.concatenate([getattr(route, name)[:1000] for route in routes]) for name in ROUTE_ARRAYS}
+    names = ("xy", "yaw", "lane", "speed_limit", "width")
+    parts = {name: np.concatenate([getattr(route, name)[:1000] for route in routes]) for name in names}
     return Route(**parts, spacing=routes[0].spacing)
-
-
-ROUTE_ARRAYS = ("xy", "yaw", "lane", "speed_limit", "width")
 
 
 def record(graph: LaneGraph, episode: Episode, seconds: float, device: str = "cpu") -> Drive:
     """Drive one episode and keep every step."""
     world = World([episode], {graph.name: graph}, device=device)
-    tables, route = world.bank.tables, world.bank.route[world.assigned]
-    half = 0.5 * world.bank.size[world.assigned][..., 0]
     columns: dict[str, list[Any]] = {}
-    for _ in range(int(seconds / world.dt)):
+    for _ in range(round(seconds / world.dt)):
         world.step()
-        state = world.state()
-        point = route[..., 0] + world.array("progress")
-        pose = world.array("pose").copy()
-        path, rule = tables.path[point], tables.rule[point]
-        offset = (pose[..., 0] - path[..., 0]) * np.cos(path[..., 2]) + (pose[..., 1] - path[..., 1]) * np.sin(
-            path[..., 2]
-        )
-        leader = world.work.leader.numpy()
-        shift, progress = world.array("shift"), world.array("aim")[..., 0]
-        changing = np.sign(shift[..., 3] - shift[..., 2]) * (progress < shift[..., 1])
-        rank = np.mod(rule[..., 3], TurnRank.YIELD)
-        turning = np.where(rank == TurnRank.LEFT, 1, np.where(rank == TurnRank.RIGHT, -1, 0))
-        turning = np.where((rule[..., 2] < ANNOUNCES) & (route[..., 1] > 1), turning, 0)
-        step_values = {
-            "pose": pose,
-            "speed": state.speed.copy(),
-            "acceleration": state.accel.copy(),
-            "present": world.array("active") != Presence.ABSENT,
-            "turn": np.where(changing != 0, changing, turning).astype(np.int8),
-            "gap": np.where(leader == NO_LEADER, np.inf, 0.01 * (leader // LEADERS)).astype(np.float32),
-            "leader": np.where(leader == NO_LEADER, -1, leader % LEADERS).astype(np.int32),
-            "line": (np.minimum(rule[..., 1], rule[..., 2]) - offset - half).astype(np.float32),
-            "lane": state.lane.astype(np.int32),
-            "signal": state.signal.astype(np.uint8),
-        }
-        for name, value in step_values.items():
+        for name, value in _observed(world).items():
             columns.setdefault(name, []).append(value[0])
     stacked = {name: np.stack(values) for name, values in columns.items()}
-    constants = world.state()
+    state = world.state()
     return Drive(
         **stacked,
-        size=constants.size[0].astype(np.float32),
-        kind=constants.kind[0].astype(np.int32),
+        size=state.size[0].astype(np.float32),
+        kind=state.kind[0].astype(np.int32),
         names=np.array([agent.name for agent in episode.agents]),
         dt=np.array([world.dt]),
     )
+
+
+def _observed(world: World) -> dict[str, Any]:
+    """Return the arrays of a `Drive` at the current step, of all scenes."""
+    state, route = world.state(), world.bank.route[world.assigned]
+    point = route[..., 0] + world.array("progress")
+    path, rule = world.bank.tables.path[point], world.bank.tables.rule[point]
+    pose, half = world.array("pose").copy(), 0.5 * world.bank.size[world.assigned][..., 0]
+    beyond = pose[..., :2] - path[..., :2]
+    offset = beyond[..., 0] * np.cos(path[..., 2]) + beyond[..., 1] * np.sin(path[..., 2])
+    leader = world.work.leader.numpy()
+    return {
+        "pose": pose,
+        "speed": state.speed.copy(),
+        "acceleration": state.accel.copy(),
+        "present": world.array("active") != Presence.ABSENT,
+        "turn": state.turn_signal.astype(np.int8),
+        "gap": np.where(leader == NO_LEADER, np.inf, 0.01 * (leader // LEADERS)).astype(np.float32),
+        "leader": np.where(leader == NO_LEADER, -1, leader % LEADERS).astype(np.int32),
+        "line": (np.minimum(rule[..., 1], rule[..., 2]) - offset - half).astype(np.float32),
+        "lane": state.lane.astype(np.int32),
+        "signal": state.signal.astype(np.uint8),
+    }
 
 
 def busiest_junctions(graph: LaneGraph, drive: Drive, count: int) -> list[tuple[float, float]]:
@@ -171,8 +167,10 @@ def busiest_junctions(graph: LaneGraph, drive: Drive, count: int) -> list[tuple[
     lanes = drive.lane[drive.present & (drive.lane >= 0)]
     visits = np.bincount(graph.junction[lanes][graph.junction[lanes] >= 0], minlength=1)
     middles: list[tuple[float, float]] = []
-    for junction in np.argsort(-visits).tolist():
-        points = np.concatenate([graph.xy[graph.points(lane)] for lane in np.flatnonzero(graph.junction == junction)])
+    for junction in np.argsort(-visits, kind="stable")[: np.count_nonzero(visits)].tolist():
+        points = np.concatenate(
+            [graph.xy[graph.points(lane)] for lane in np.flatnonzero(graph.junction == junction).tolist()]
+        )
         x, y = (float(value) for value in 0.5 * (points.min(axis=0) + points.max(axis=0)))
         if all(math.dist((x, y), other) > AREA for other in middles):
             middles.append((x, y))
@@ -192,14 +190,19 @@ class View:
     """
 
     def __init__(self, graph: LaneGraph, centre: tuple[float, float], size: tuple[int, int], width: float) -> None:
-        self.graph, self.centre, self.size, self.width = graph, centre, size, width
-        self.scale = size[0] / width
+        self.graph, self.size, self.width, self.scale = graph, size, width, size[0] / width
+        self.strips = make_lane_strips(graph)
+        self.areas = junction_areas(graph, self.strips)
+        self.move(centre)
+
+    def move(self, centre: tuple[float, float]) -> None:
+        """Show another place."""
+        graph, size, self.centre = self.graph, self.size, centre
         self.background: Frame = np.full((size[1], size[0], 3), GROUND, np.uint8)
         self.image = self.background
-        strips = make_lane_strips(graph)
-        for area in junction_areas(graph, strips):
+        for area in self.areas:
             self._fill(area, ROAD)
-        for strip in strips:
+        for strip in self.strips:
             self._fill(strip.outline, SIDEWALK if strip.layer == 0 else ROAD)
             if strip.layer == LAYERS[LaneType.DRIVING] and not strip.junction:
                 self._line(strip.left, EDGE, 1)
@@ -217,17 +220,11 @@ class View:
         return self.image
 
     def _stop_lines(self, states: Ints) -> None:
-        graph = self.graph
-        for signal, lane, s in zip(graph.stop_signal, graph.stop_lane, graph.stop_s, strict=True):
+        for signal, x, y, yaw, half in _stop_lines(self.graph):
             colour = LAMP.get(int(states[signal]))
-            if colour is None:
-                continue
-            points = graph.points(int(lane))
-            x, y = (float(np.interp(s, graph.s[points], graph.xy[points, axis])) for axis in (0, 1))
-            yaw = float(np.interp(s, graph.s[points], np.unwrap(graph.yaw[points])))
-            half = 0.45 * float(np.interp(s, graph.s[points], graph.width[points]))
-            side = half * np.array([-math.sin(yaw), math.cos(yaw)])
-            self._line([np.array([x, y]) - side, np.array([x, y]) + side], colour, 4)
+            if colour is not None:
+                side = half * np.array([-math.sin(yaw), math.cos(yaw)])
+                self._line([np.array([x, y]) - side, np.array([x, y]) + side], colour, 4)
 
     def _agent(self, drive: Drive, step: int, agent: int) -> None:
         x, y, yaw = (float(value) for value in drive.pose[step, agent])
@@ -270,8 +267,8 @@ def frames(views: Sequence[View], drive: Drive, steps: Sequence[int], agent: int
     for step in steps:
         clock = f"{drive.dt[0] * (step + 1):6.1f} s"
         if agent is not None:
-            pose = drive.pose[step, agent]
-            views = [View(views[0].graph, (float(pose[0]), float(pose[1])), views[0].size, views[0].width)]
+            x, y, _ = drive.pose[step, agent].tolist()
+            views[0].move((x, y))
         pictures = [view.draw(drive, step, f"{clock}  ({view.centre[0]:.0f}, {view.centre[1]:.0f})") for view in views]
         if len(pictures) % 2 and len(pictures) > 1:
             pictures.append(np.full_like(pictures[0], 255))
@@ -280,7 +277,7 @@ def frames(views: Sequence[View], drive: Drive, steps: Sequence[int], agent: int
 
 
 def remarks(graph: LaneGraph, drive: Drive) -> list[tuple[float, str]]:
-    """Return what is worth a look: time in s, and agents, places and values in one line."""
+    """Return what is worth a look after the settling time: time in s, and agents, places and values in one line."""
     lines: list[tuple[float, str]] = []
     dt, steps = float(drive.dt[0]), len(drive.speed)
     moves = drive.kind != AgentKind.WALKER
@@ -307,7 +304,38 @@ def remarks(graph: LaneGraph, drive: Drive) -> list[tuple[float, str]]:
     _spells(waits, dt, lambda step, agent, s: tell(step, agent, f"stands for {s:.0f} s") if s > 60.0 else None)
     off = moves & drive.present & (drive.lane < 0)
     _spells(off, dt, lambda step, agent, s: tell(step, agent, f"off the lanes for {s:.1f} s"), 0.5)
-    return sorted(lines)
+    for step, agent, red in _red_starts(graph, drive):
+        tell(step, agent, f"passes its stop line {red:.1f} s after red began")
+    return sorted(line for line in lines if line[0] > SETTLE)
+
+
+def _red_starts(graph: LaneGraph, drive: Drive) -> Iterator[tuple[int, int, float]]:
+    """Yield step, agent and s of red where somebody drives over a stop line on red, but for turns to the near side."""
+    forward = np.stack([np.cos(drive.pose[..., 2]), np.sin(drive.pose[..., 2])], axis=-1)
+    front = drive.pose[..., :2] + 0.5 * drive.size[:, 0, None] * forward
+    near_side = 1 if graph.left_hand[0] else -1
+    able = drive.present & (drive.kind != AgentKind.WALKER) & (drive.turn != near_side)
+    for signal, x, y, yaw, half in _stop_lines(graph):
+        along = np.array([math.cos(yaw), math.sin(yaw)])
+        offset = front - np.array([x, y])
+        beyond, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+        on_lane = able & (np.abs(aside) < half) & (forward @ along > 0.8)
+        passed = on_lane[1:] & on_lane[:-1] & (beyond[:-1] < PAST_LINE) & (beyond[1:] >= PAST_LINE)
+        red = drive.signal[:, signal] == SignalState.RED
+        for step, agent in np.argwhere(passed & red[1:, None]).tolist():
+            other = np.flatnonzero(~red[: step + 1])
+            seconds = float(drive.dt[0]) * (step + 1 - (int(other[-1]) if len(other) else 0))
+            if seconds > LATE:
+                yield step + 1, agent, seconds
+
+
+def _stop_lines(graph: LaneGraph) -> Iterator[tuple[int, float, float, float, float]]:
+    """Yield signal, x, y, yaw and half width, in m and rad, of each stop line."""
+    for signal, lane, s in zip(graph.stop_signal, graph.stop_lane, graph.stop_s, strict=True):
+        points = graph.points(int(lane))
+        x, y = (float(np.interp(s, graph.s[points], graph.xy[points, axis])) for axis in (0, 1))
+        yaw = float(np.interp(s, graph.s[points], np.unwrap(graph.yaw[points])))
+        yield int(signal), x, y, yaw, 0.45 * float(np.interp(s, graph.s[points], graph.width[points]))
 
 
 def _near_pairs(drive: Drive, step: int) -> Iterator[tuple[int, int]]:
@@ -357,6 +385,7 @@ def main() -> None:
     parser.add_argument("--cyclists", type=int, default=5)
     parser.add_argument("--seed", type=int, default=5000, help="number of the scene; published tables use those from 0")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--anew", action="store_true", help="drive again: the recorded drive is of another version")
     parser.add_argument("--speed", type=int, default=4, help="times as fast as life")
     parser.add_argument("--at", type=_numbers, help="X,Y in m: one view, there")
     parser.add_argument("--agent", type=int, help="one view, which goes with this agent")
@@ -374,34 +403,35 @@ def main() -> None:
     if is_new:
         for time, line in remarks(graph, drive):
             print(f"{time:6.1f} s  {line}")
-    last = (
-        min(len(drive.speed), round(given.end / float(drive.dt[0]))) if math.isfinite(given.end) else len(drive.speed)
-    )
-    size = int(given.size[0]), int(given.size[1])
-    first = round(given.begin / float(drive.dt[0]))
-    if given.agent is not None or given.at or given.whole:
-        name = (
-            f"agent-{given.agent}"
-            if given.agent is not None
-            else "town"
-            if given.whole
-            else "{:.0f},{:.0f}".format(*given.at)
-        )
-        views = [_whole(graph, size) if given.whole else View(graph, given.at or (0.0, 0.0), size, given.width)]
-    else:
-        name = "junctions"
-        views = [View(graph, middle, size, given.width) for middle in busiest_junctions(graph, drive, VIEWS)]
+    name, views = views_of(graph, drive, given)
+    dt, steps = float(drive.dt[0]), len(drive.speed)
+    first, last = round(given.begin / dt), round(min(given.end / dt, steps))
     if given.sheet:
-        every = max(1, round(given.sheet / float(drive.dt[0])))
-        pictures = [*frames(views, drive, range(first, last, every), given.agent)]
+        shown = range(first, last, max(1, round(given.sheet / dt)))
         path = given.out / f"{graph.name}-{name}-{given.begin:.0f}.jpg"
+        sheet = contact_sheet([*frames(views, drive, shown, given.agent)], given.columns)
         with atomic_path(path) as temporary:
-            Image.fromarray(contact_sheet(pictures, given.columns)).save(temporary, "JPEG", quality=80)
+            Image.fromarray(sheet).save(temporary, "JPEG", quality=80)
     else:
         path = given.out / f"{graph.name}-{name}.mp4"
-        pictures = frames(views, drive, range(first, last), given.agent)
-        save_frames(pictures, path, dt=float(drive.dt[0]) / given.speed)
+        save_frames(frames(views, drive, range(first, last), given.agent), path, dt=dt / given.speed)
     print(path)
+
+
+def views_of(graph: LaneGraph, drive: Drive, given: argparse.Namespace) -> tuple[str, list[View]]:
+    """Return a name for the views that were asked for, and the views."""
+    size = int(given.size[0]), int(given.size[1])
+    if given.agent is not None:
+        return f"agent-{given.agent}", [View(graph, (0.0, 0.0), size, given.width)]
+    if given.at:
+        return "{:.0f},{:.0f}".format(*given.at), [View(graph, given.at, size, given.width)]
+    if given.whole:
+        lower, upper = graph.xy.min(axis=0) - 10.0, graph.xy.max(axis=0) + 10.0
+        x, y = (0.5 * (lower + upper)).tolist()
+        width = max(upper[0] - lower[0], (upper[1] - lower[1]) * size[0] / size[1])
+        return "town", [View(graph, (x, y), size, float(width))]
+    middles = busiest_junctions(graph, drive, VIEWS)
+    return "junctions", [View(graph, middle, size, given.width) for middle in middles]
 
 
 def _numbers(text: str) -> tuple[float, float]:
@@ -413,7 +443,7 @@ def recorded(graph: LaneGraph, given: argparse.Namespace) -> tuple[Drive, bool]:
     """Return the drive in the output folder if it is of the same command, else a new one, and whether it is new."""
     file, same = given.out / f"{graph.name}.npz", ("minutes", "drivers", "vehicles", "walkers", "cyclists", "seed")
     about = json.dumps({"world": VERSION} | {name: getattr(given, name) for name in same})
-    if file.is_file():
+    if file.is_file() and not given.anew:
         arrays = load_npz(file)
         if str(arrays.pop("about")) == about:
             return Drive(**arrays), False
@@ -421,13 +451,6 @@ def recorded(graph: LaneGraph, given: argparse.Namespace) -> tuple[Drive, bool]:
     given.out.mkdir(parents=True, exist_ok=True)
     save_npz(file, {field.name: getattr(drive, field.name) for field in fields(Drive)} | {"about": np.array(about)})
     return drive, True
-
-
-def _whole(graph: LaneGraph, size: tuple[int, int]) -> View:
-    """Return a view of the whole town."""
-    lower, upper = graph.xy.min(axis=0) - 10.0, graph.xy.max(axis=0) + 10.0
-    x, y = (float(value) for value in 0.5 * (lower + upper))
-    return View(graph, (x, y), size, float(max(upper[0] - lower[0], (upper[1] - lower[1]) * size[0] / size[1])))
 
 
 if __name__ == "__main__":

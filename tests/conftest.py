@@ -46,6 +46,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         home = tempfile.mkdtemp(prefix="ssad-tests-")
         os.environ["SSAD_HOME"] = home
+        if sys.dont_write_bytecode:  # what one of the run's many processes has compiled serves the others, nobody else
+            os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = f"{home}/bytecode"
+            os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+            sys.dont_write_bytecode = False
         config.add_cleanup(lambda: shutil.rmtree(home, ignore_errors=True))
 
 

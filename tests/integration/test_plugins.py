@@ -294,6 +294,7 @@ NOT_OBJECTS: dict[str, str] = {
     "TargetTable.name": "the suite's own name",
     # choices that the kinds themselves make, in code of their own
     "ScenarioSuite.cluster": "what is drawn independently",
+    "TrafficSuite.drivers": "how the drivers of background traffic are drawn",
     "ScenarioSuite.sweep": "values of parameters, or the word `grid`",
     "ScenarioSuite.sweep_mode": "how the values of a sweep are combined",
     "ScenarioSuite.matrix": "parameters of a sweep",

@@ -460,6 +460,10 @@ class SignalPlan:
     elsewhere: Literal["program", "off", "red", "green"] = "program"
 
 
+MOST_ERRORS = 1800.0
+"""Errors of a driver an hour at most: one error after the other, 2 s each."""
+
+
 @dataclass(frozen=True)
 class DriverStyle:
     """Parameters of one driver of background traffic, in place of those that all Autopilots have.
@@ -549,7 +553,7 @@ class TrafficPlan:
         draw: Number of the draw of vehicles, which is then the same in every episode; None: the episode's seed.
         drivers: `uniform`: all vehicles have the Autopilot's parameters. `population`: each has a driver drawn from
             published distributions.
-        errors: Errors of each driver of the population an hour; see `DriverStyle`.
+        errors: Errors of each driver of the population an hour, at most `MOST_ERRORS`; see `DriverStyle`.
         walkers: Number of walkers on the sidewalks near the route, alone and in groups; fewer where there is no room.
             They cross roads.
         cyclists: Number of cyclists on the driving lanes near the route; fewer where there is no room.

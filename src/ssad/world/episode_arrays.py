@@ -464,6 +464,8 @@ def build(  # noqa: PLR0917
         programs[index, : len(graph.signal_phase)] = signal_programs(graph)
     model_indices = np.asarray(arrays["model"])
     tables = _tables(town_graphs, pool)
+    # `graphs` may name a town by the path of its map, tables name it by the graph
+    left_hand = {graph.name: bool(graph.left_hand[0]) for graph in town_graphs}
     walkers = None
     if has_walkers(episodes):
         walkers = build_walkers(episodes, graphs, np.asarray(arrays["route"]), tables.path, tables.rule, device)
@@ -474,9 +476,7 @@ def build(  # noqa: PLR0917
         scripts.sizes,
         scripts.episode_sizes,
         tables,
-        np.concatenate(
-            [turn_sides(table.rule[:, 3], left_hand=bool(graphs[table.town].left_hand[0])) for table in pool.tables]
-        ),
+        np.concatenate([turn_sides(table.rule[:, 3], left_hand=left_hand[table.town]) for table in pool.tables]),
         agent_count,
         np.where(
             model_indices < 0, int(AgentKind.NONE), np.asarray(arrays["kind"])[np.maximum(model_indices, 0)]

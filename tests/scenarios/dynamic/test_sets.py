@@ -106,7 +106,7 @@ def test_the_natural_sets_have_the_population_with_walkers_and_cyclists() -> Non
     assert all(s.traffic is not None and s.traffic.draw is not None for s in CHOSEN)
     assert TRAFFIC.drivers == "population"
     agents = [a for s in CHOSEN[::15] for a in episode(s.name).agents[1:]]
-    assert all((a.driver is None) == (a.model in ("walker", "bicycle")) for a in agents)
+    assert all((a.driver is None) == (a.model == "walker") for a in agents)
     assert sum(a.model == "walker" for a in agents) > 100
     assert sum(a.model == "bicycle" for a in agents) > 10
 

@@ -37,7 +37,9 @@ def drive(test: Episode, seconds: float) -> tuple[F64, F64, F64]:
 def test_a_driver_starts_with_its_jerk_and_acceleration_and_holds_its_speed() -> None:
     _, speed, acceleration = drive(road(CALM), 25.0)
     assert np.abs(np.diff(acceleration)).max() <= 0.1 * CALM.jerk + 1e-3
-    assert acceleration.max() == pytest.approx(CALM.acceleration, abs=0.15)
+    # stronger from rest than while following
+    assert 1.2 * CALM.acceleration < acceleration.max() < 1.6 * CALM.acceleration
+    assert acceleration[speed > 8.0].max() < CALM.acceleration
     assert speed[-1] == pytest.approx(12.0, abs=0.4)
 
 

@@ -22,16 +22,20 @@ from ssad.world.kernels.drivers import (
     FIRM,
     HARDEST,
     NOTICES,
+    RELAXES,
     delay,
     driver_accelerates,
     driver_power,
     is_lapsed,
     lane_place,
+    looks_at_crossing,
     pedal_change,
 )
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
+MOVES = wp.constant(0.5)  # m/s
+BEHIND = wp.constant(20.0)  # m
 HALTED = wp.constant(0.1)  # m/s
 NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
 STARTS = wp.constant(0.15)  # m/s^2: for less nobody starts
@@ -105,7 +109,11 @@ def driven_acceleration(
     pending = state.pending[b, i][0]
     # predictions flicker from step to step: a driver sees them as one
     reaction = state.pending[b, i][1]
-    reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
+    asked = wp.max(state.react[b, i], -HARDEST)
+    if asked < reaction:
+        reaction = reaction + NOTICES * (asked - reaction)
+    elif looks_at_crossing(state, b, i):
+        reaction = reaction + RELAXES * (asked - reaction)
     demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), driver_power(speed, style) + reaction)
     junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:
@@ -160,6 +168,20 @@ def room_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_ro
             ):
                 free = 0
     return free == 1
+
+
+@wp.func
+def is_calm_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_row: int) -> bool:
+    """Return whether nobody moves in the half circle behind a vehicle that is about to back out."""
+    pose = perceived.pose[b, i]
+    calm = bool(True)
+    for j in range(from_row, to_row):
+        if j != i and perceived.kind[b, j] != AgentKind.NONE and wp.abs(perceived.speed[b, j]) > MOVES:
+            dx = perceived.pose[b, j][0] - pose[0]
+            dy = perceived.pose[b, j][1] - pose[1]
+            if dx * wp.cos(pose[2]) + dy * wp.sin(pose[2]) < 0.0 and dx * dx + dy * dy < BEHIND * BEHIND:
+                calm = bool(False)
+    return calm
 
 
 @wp.func
@@ -223,7 +245,9 @@ def drive_one(
             if i == 0 and perceived.believes[b] == 1:
                 from_row = agents
                 to_row = rows
-            if room_behind(perceived, b, i, from_row, to_row):
+            if room_behind(perceived, b, i, from_row, to_row) and (
+                not has_driver or is_calm_behind(perceived, b, i, from_row, to_row)
+            ):
                 throttle = 0.0
                 if speed > -1.0:
                     throttle = 0.4

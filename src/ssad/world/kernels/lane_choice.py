@@ -54,6 +54,7 @@ DECIDES = wp.constant(5)  # steps between two decisions
 SLOWER = wp.constant(0.8)  # m/s: who is hardly slower is not passed
 SLOWS = wp.constant(-0.7)  # m/s^2: who brakes for something ahead is not passed
 CLEARS = wp.constant(6.0)  # m ahead of whoever it has passed from which a driver returns
+NEARS = wp.constant(0.35)  # share of the difference of speeds that is lost meanwhile
 COMES_UP = wp.constant(8.0)  # s: nobody returns behind somebody slower whom it would soon come up with
 
 
@@ -238,8 +239,9 @@ def pass_leader(
             return
     shortest = 2.0 * RAMP_LEAST * own_body[0]
     duration = courtesy[1]
-    gains = 0.5 * wp.clamp(top - speed, 0.0, 0.25 * style[2] * duration)
-    change_length = wp.max(shortest, duration * (speed + gains))
+    # a driver that comes up with somebody loses some speed until it is past
+    closing = wp.max(speed - wp.max(other_speed, 0.0), 0.0)
+    change_length = wp.max(shortest, duration * (speed - NEARS * closing))
     # until it is back in its lane: a distance that grows by what the other goes until it is passed
     ramp = wp.max(shortest, RAMP_TIME * top)
     room = beyond + own_body[0] + CLEARS

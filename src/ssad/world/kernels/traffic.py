@@ -43,6 +43,7 @@ from ssad.world.kernels.drivers import (
     early_react,
     is_lapsed,
     judged_share,
+    looks_at_crossing,
 )
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
 from ssad.world.kernels.meeting import (
@@ -77,14 +78,14 @@ LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which 
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
 PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
-SOON_THERE = wp.constant(3.0)  # s until then
+SOON_THERE = wp.constant(5.0)  # s until then
+LETS_BELOW = wp.constant(1.5)  # m/s of a driver that starts
 TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
 WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
 BACKS_TIME = wp.constant(2.0)  # s for which a driver expects somebody to go on backwards
 PARALLEL = wp.constant(0.9)  # cosine of two headings
-SLOW = wp.constant(5.0)  # m/s of somebody who starts
+STOPS_THERE = wp.constant(0.5)  # m/s^2
 STARTS = wp.constant(0.3)  # m/s^2 of it
-FURTHER = wp.constant(3)  # times the strides ahead that its path is looked along
 LONGER = wp.constant(6)  # strides beyond the forecast
 RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
 MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
@@ -102,6 +103,7 @@ STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in th
 JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
 ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
 AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -323,6 +325,19 @@ def arrives_first(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j:
 
 
 @wp.func
+def crosses_first(perceived: PerceivedAgents, b: int, i: int, j: int) -> bool:
+    """Return whether i is first at the crossing of their straight paths; an agent that brakes for j stays second."""
+    own_pose = perceived.pose[b, i]
+    other_pose = perceived.pose[b, j]
+    sine = wp.sin(other_pose[2] - own_pose[2])
+    dx = other_pose[0] - own_pose[0]
+    dy = other_pose[1] - own_pose[1]
+    far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
+    far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
+    return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+
+
+@wp.func
 def has_priority(
     bank: EpisodeArrays,
     roads: Roads,
@@ -360,17 +375,8 @@ def has_priority(
         return own_way[2] < other_way[2]
     if wp.abs(own_way[1] - other_way[1]) > 1.0:
         return own_way[1] < other_way[1]
-    if inside_i and inside_j:
-        own_pose = perceived.pose[b, i]
-        other_pose = perceived.pose[b, j]
-        sine = wp.sin(other_pose[2] - own_pose[2])
-        if wp.abs(sine) > 0.5:
-            # First at the crossing of their straight paths; an agent that brakes for the other stays second.
-            dx = other_pose[0] - own_pose[0]
-            dy = other_pose[1] - own_pose[1]
-            far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
-            far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
-            return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+    if inside_i and inside_j and wp.abs(wp.sin(perceived.pose[b, j][2] - perceived.pose[b, i][2])) > 0.5:
+        return crosses_first(perceived, b, i, j)
     return i < j
 
 
@@ -602,15 +608,17 @@ def scan_agents(
     if i == 0 and perceived.believes[b] == 1:
         from_row = agents
         to_row = rows
+    # a driver of the population looks at crossing traffic in some steps only, and keeps in mind what it saw
+    looks_aside = style[0] == 0.0 or looks_at_crossing(state, b, i)
     for j in range(from_row, to_row):
         if j != i and perceived.kind[b, j] != AgentKind.NONE and not is_natural_walker(bank, e, j):
             box = perceived.span[b, j]
+            if not looks_aside:
+                here = perceived.pose[b, j]
+                box = wp.vec4(here[0], here[1], here[0], here[1])
             last_pose = perceived.forecast[b, j, HORIZON - 1]
-            if extra > 0:
-                far_ahead = extra
-                if perceived.speed[b, j] < SLOW:
-                    far_ahead = FURTHER * extra
-                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + far_ahead)
+            if looks_aside and extra > 0:
+                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
                 box = extend_box(box, last_pose)
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
                 other_half = perceived.half[b, j]
@@ -632,8 +640,10 @@ def scan_agents(
                 )
                 if in_box and longitudinal > -bend - own_body[0] and wp.abs(lateral) < bend + half_width:
                     flags = 1
-                if wp.abs(perceived.speed[b, j]) > 0.2 and (
-                    longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width
+                if (
+                    looks_aside
+                    and wp.abs(perceived.speed[b, j]) > 0.2
+                    and (longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width)
                 ):
                     # An agent behind in the same lane and direction keeps its distance itself.
                     bend_j = perceived.way[b, j][3]
@@ -722,12 +732,8 @@ def meet_driver(
     other_accel = float(0.0)
     if j < agents:
         other_accel = state.accel[b, j]
-    if goes_first:
-        other_accel = wp.min(other_accel, 0.0)
-    else:
+    if not goes_first:
         before = wp.vec2(MARGIN, UNSURE)
-        if other_accel > STARTS and perceived.speed[b, j] < SLOW:
-            extra = FURTHER * extra
     return find_meeting(
         roads,
         perceived,
@@ -778,11 +784,14 @@ def driver_gives_way(
     if not is_there:
         other_need = other_speed / (2.0 * meeting.begin)
     power = driver_power(speed, style)
+    end = meeting.end
+    if is_there and other_accel < -STOPS_THERE and other_speed < -2.0 * other_accel * end:
+        end = FAR  # it may stop in the way
     early = early_distance(meeting.near, speed, state.accel[b, i], bank.manner[e, i][1], style)
     stop = early_react(driver_yields(speed, meeting.near, style), driver_yields(speed, early, style), speed, style)
-    comes_after = driver_arrives_after(speed, meeting.near, meeting.end + AFTERWARDS, style)
+    comes_after = driver_arrives_after(speed, meeting.near, end + AFTERWARDS, style)
     react = wp.max(stop, comes_after)
-    if speed * meeting.end < meeting.near:
+    if speed * end < meeting.near:
         react = wp.max(react, -style[3] - power)  # it has passed by then in any case
     stops = (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES)
     stands = other_speed < WAITING and other_accel < STARTS
@@ -803,8 +812,10 @@ def driver_gives_way(
             return wp.max(follows, -style[3] - power)
         elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and other_need < RELIES:
+    if goes_first and other_need < WARY:
         return 0.0  # the other one can stop
+    if goes_first and other_need < RELIES:
+        return -power  # it should, but who knows: the driver gains no speed
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
         return 0.0  # most of the stretch lies behind
@@ -928,7 +939,7 @@ def react_to_agents(
                 react = follow(speed, wp.max(leader[1], 0.0), leader_gap, style)
                 if (
                     style[0] > 0.0
-                    and flags == 3
+                    and (flags == 3 or not looks_at_crossing(state, b, i))
                     and not walks
                     and heading[0] * c + heading[1] * s < ALIGNED
                     and wp.abs(perceived.speed[b, j]) > CROSSES
@@ -980,7 +991,7 @@ def react_to_agents(
             if style[0] > 0.0:
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                 goes_first = change_priority(perceived, b, i, j, goes_first) or judgement[1] > 0.0
-                if speed < STARTS_BELOW and wp.abs(perceived.speed[b, j]) > PASSES:
+                if speed < LETS_BELOW and wp.abs(perceived.speed[b, j]) > PASSES:
                     # who starts lets somebody pass who is about to
                     other_distance = wp.length(wp.vec2(other_pose[0] - pose[0], other_pose[1] - pose[1]))
                     if other_distance < SOON_THERE * wp.abs(perceived.speed[b, j]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
-from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, LaneType, Scenario, TrafficPlan
+from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, LaneType, Pose, Scenario, TrafficPlan
+from ssad.drivers.builtin import Autopilot
 from ssad.metrics.human_driving import spread
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.knowledge.natural_junction import APART
@@ -32,7 +34,9 @@ from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.kernels.data import WalkStatus
 from ssad.world.roads import LaneGraph, load_town, random_route
 from ssad.world.roads.crossings import road_crossings
+from ssad.world.rollout import rollout
 from ssad.world.world import World
+from tests.world.roads.test_xodr import lane, lanes, road, section, town
 from tests.world.worlds import line_route, straight_graph
 
 SCENARIO = load_scenarios("natural-uniform")[0]
@@ -197,6 +201,43 @@ def test_a_town_without_sidewalks_has_no_walkers() -> None:
     lane = int(np.flatnonzero((track.kind == LaneType.DRIVING) & (track.junction < 0))[0])
     route = random_route(track, lane, 0.0, 200.0, generator("route"))
     assert draw_walkers(TrafficPlan(walkers=5), track, route, [], 30.0, "key") == []
+
+
+@pytest.mark.parametrize(
+    ("right", "left", "walkers"),
+    [
+        (lane(-1), "", 0),
+        (lanes(-1), lanes(1), 0),
+        (lane(-1) + lane(-2, kind="sidewalk"), lanes(1), 4),
+    ],
+    ids=["one lane", "no sidewalk", "one sidewalk"],
+)
+def test_natural_traffic_comes_to_any_map_as_far_as_there_is_room(
+    tmp_path: Path, right: str, left: str, walkers: int
+) -> None:
+    """A road of 100 m that ends, without a junction: ways are short, and some kinds have no place."""
+    graph = town(tmp_path, road(sections=section(left, right)))
+    plan = TrafficPlan(minimum=2, wake_distance=0.0, drivers="population", walkers=4, cyclists=2)
+    route = (Pose(10.0, -1.75, 0.0), Pose(90.0, -1.75, 0.0))
+    scenario = Scenario("own/0", "FreeDrive", "maps/own.xodr", route, traffic=plan)
+    episode = build_episode(scenario, graph, seed=0)
+    models = [agent.model for agent in episode.agents[1:]]
+    assert models.count("walker") == walkers
+    assert "bicycle" in models or not left
+    (trace,) = rollout(World([episode], {"maps/own.xodr": graph}), Autopilot())
+    assert trace.end != "collision"
+    assert trace.route_complete[-1] > 50.0
+
+
+def test_a_short_way_to_the_end_of_a_road_has_room_for_a_cyclist() -> None:
+    track = load_town("Twinford")
+    way = random_route(track, int(np.flatnonzero(track.kind == LaneType.DRIVING)[0]), 0.0, 200.0, generator("route"))
+    for count in (2, 3, 9, 12, 13, 30):
+        columns = {name: getattr(way, name)[:count] for name in ("xy", "yaw", "lane", "speed_limit", "width")}
+        short = replace(way, **columns)
+        moved = cycling_route(track, short, 0.8)
+        assert moved.xy.shape == short.xy.shape
+        assert np.hypot(*(moved.xy - short.xy).T).max() < 3.0
 
 
 @pytest.mark.parametrize(

@@ -370,7 +370,7 @@ def cycling_route(graph: LaneGraph, route: Route, from_edge: float) -> Route:
             width = float(graph.width[graph.points(neighbour)].mean())
             on_lane = route.lane == lane
             aside[on_lane] = near_side * 0.5 * (route.width[on_lane].astype(np.float64) + width)
-    kernel = np.ones(2 * (BLEND // 2) + 1)
+    kernel = np.ones(2 * min(BLEND // 2, (len(aside) - 1) // 2) + 1)  # a short route at the end of a map
     aside = np.convolve(aside, kernel, mode="same") / np.convolve(np.ones(len(aside)), kernel, mode="same")
     yaw = np.unwrap(route.yaw.astype(np.float64))
     xy = route.xy.astype(np.float64) + aside[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})  # nothing differentiates a shift: half the compilation
+
 
 @wp.kernel
 def recode(

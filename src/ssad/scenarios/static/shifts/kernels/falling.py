@@ -15,6 +15,8 @@ from ssad.scenarios.static.shifts.kernels.shared import (
     unit,
 )
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 OVER = wp.constant(wp.uint64(256 + (256 << 21) + (256 << 42)))
 
 

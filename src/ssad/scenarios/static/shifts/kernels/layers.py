@@ -4,6 +4,8 @@ import warp as wp
 
 from ssad.scenarios.static.shifts.kernels.shared import byte, colour, draw, put_colour, unit
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 
 @wp.kernel
 def brightest(image: wp.array(dtype=wp.uint32), row: int, words: int, highest: wp.array2d(dtype=int)):

@@ -4,6 +4,8 @@ import warp as wp
 
 from ssad.scenarios.static.shifts.kernels.shared import draw
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 
 @wp.func
 def add_clipped(value: wp.uint32, noise: wp.int16) -> wp.uint32:

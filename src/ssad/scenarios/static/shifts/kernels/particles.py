@@ -4,6 +4,8 @@ import warp as wp
 
 from ssad.scenarios.static.shifts.kernels.shared import colour, draw, unit
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 
 @wp.struct
 class Air:

@@ -17,6 +17,8 @@ from ssad.scenarios.static.shifts.kernels.shared import (
     value_noise,
 )
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 
 @wp.kernel
 def patchiness(

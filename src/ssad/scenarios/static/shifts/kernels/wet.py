@@ -7,6 +7,8 @@ import warp as wp
 from ssad.scenarios.static.shifts.kernels.light import CODES, WHITE
 from ssad.scenarios.static.shifts.kernels.shared import pixel_of, put_four, value_noise
 
+wp.set_module_options({"enable_backward": False})  # see `exposure`
+
 FARTHEST_GROUND = wp.constant(120.0)  # m: beyond it, ground and house fronts share a cell
 FARTHEST_PLANE = wp.constant(60.0)  # where depth is not given
 STEPS = wp.constant(30)  # along the mirrored ray, each `RATIO` times as far away as the one before
