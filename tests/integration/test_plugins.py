@@ -67,6 +67,7 @@ PLUGINS = {
     "perturbation": Plugin("perturbation:Sticker", "example-sticker"),
     "fault": Plugin("fault:WetLens", "example-wet-lens", {"period": 2.0}),
     "generator": Plugin("generator:Corners", "example-corners", {"margin": 0.1}),
+    "adversary": Plugin("adversary:BrakeTest", "example-brake-test", {"radius": 15.0}),
     "scenario": Plugin("scenario:SCENARIO", "ExampleWalkers"),
     "simulator": Plugin("simulator:WornBrakes", "example-worn-brakes", {"brake": 0.5}),
     "kind": Plugin("kind:Coin", "example-coin"),
