@@ -818,7 +818,7 @@ def driver_gives_way(
             return wp.max(follows, -style[3] - power)
         elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and other_need < WARY:
+    if goes_first and (other_need < WARY or (other_need < RELIES and meeting.near < ENTERED)):
         return 0.0  # the other one can stop
     if goes_first and other_need < RELIES:
         return -power - DOUBTS * style[3]  # it should, but does not yet
