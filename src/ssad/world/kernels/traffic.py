@@ -810,8 +810,10 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            is_ahead = lead < -JOINS and goes_first
-            if is_there or parallel or is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            is_ahead = is_there or parallel or (lead < -JOINS and goes_first)
+            if speed < LETS_BELOW and not goes_first and state.aim[b, i][0] < state.shift[b, i][1]:
+                is_ahead = bool(False)  # who begins to change lanes from rest is not ahead yet
+            if is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
