@@ -112,10 +112,11 @@ def traffic(
     walkers: int = 0,
     cyclists: int = 0,
     seconds: float = 300.0,
+    errors: float = 0.0,
 ) -> Episode:
     """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads.
 
-    Walkers walk for `seconds`.
+    Walkers walk for `seconds`. Drivers of the population make so many errors an hour each.
     """
     draws = generator("traffic", graph.name, key)
     agents: list[EpisodeAgent] = []
@@ -134,7 +135,8 @@ def traffic(
         agent = EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route)
         if drivers == "population":
             # how fast it likes to go is its driver's pace
-            agent = with_driver(replace(agent, target_speed=float(route.speed_limit.max())), key, len(agents))
+            agent = replace(agent, target_speed=float(route.speed_limit.max()))
+            agent = with_driver(agent, key, len(agents), errors=errors)
         agents.append(agent)
     if cyclists:
         agents += town_cyclists(graph, routes, agents, cyclists, key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -74,3 +75,14 @@ def test_the_working_folder_is_looked_in_first_and_once(folder: Path) -> None:
         resolve("thing", TABLE, "json_like:A.hidden")
     with pytest.raises(ConfigError, match=r"json_like has no 'zzz'$"):
         resolve("thing", TABLE, "json_like:A.zzz")
+
+
+def test_what_is_installed_after_a_look_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.utime(tmp_path, (0, 0))  # what changes within a tick of the file system's clock has the same time
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "late" not in names("system", {})
+    info = tmp_path / "late-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[ssad.systems]\nlate = late.driver:Late\n")
+    assert names("system", {})["late"] == "late.driver:Late"

@@ -86,13 +86,13 @@ BAD = {
     "text": ("failed", 'the result is impossible: metrics.value is "much", which is no number'),
     "memory": ("crashed", "out of memory: it held"),
 }
-HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 5 s"))
+HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 2 s"))
 
 
 def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -> None:
     """Only what hangs has little time: all else must have enough on a machine that is busy."""
     good = ["a", "b", "c", "d"]
-    for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 5.0)):
+    for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 2.0)):
         suite = dice([*good[:2], *deeds, *good[2:]], chunk=batch, timeout_s=timeout_s)
         records = go(suite, folder / name, workers, ray=ray, kind=other_dice.LyingDice)
         found = {r["number"]: r for r in records}
@@ -143,7 +143,7 @@ def test_on_ray_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, workers: int) -> None:
     """Five numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
     numbers = [f"n-{i}" for i in range(5)]
-    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=5.0)
+    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=2.0)
     plan = other_dice.SharedDice().plan(suite)
     records = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())))
     status = {name: {r["status"] for r in records if r["system"] == name} for name in suite.systems}

@@ -46,7 +46,7 @@ def test_a_state_holds_the_ego_the_adversary_and_the_nearest_other() -> None:
     np.testing.assert_allclose(chosen[[1, 2], 0], [20.0, 8.0], atol=1e-4)
     far = region_states(world.state(), np.array([0]), np.array([3])).reshape(3, 6)
     assert not far[1].any()  # more than 25 m away
-    np.testing.assert_allclose(body_distance(nearest.reshape(1, 18)), [3.5 - 2.06], atol=1e-4)
+    np.testing.assert_allclose(body_distance(nearest.reshape(1, 18)), [np.hypot(8.0 - 4.9, 3.5 - 2.06)], atol=1e-4)
     assert body_distance(np.zeros((1, 18), np.float32)).tolist() == [np.inf]
 
 

@@ -11,10 +11,12 @@ import difflib
 import importlib
 import inspect
 import json
+import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -195,9 +197,9 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
         except ModuleNotFoundError as error:
             # Torch and others are optional; name the extra instead of the module.
             raise missing_extra(error, f"{kind} '{name}'") or error from None
-    plugins = {point.name: point for point in entry_points(group=group_of(kind))}
+    plugins = offered_names(group_of(kind))
     if name in plugins:
-        return _import(kind, name, plugins[name].value)
+        return _import(kind, name, plugins[name])
     if ":" in name:
         return _import(kind, name, name)
     raise unknown_name(kind, name, [*table, *plugins])
@@ -218,8 +220,27 @@ def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
     Returns:
         Name -> "module:object", built-in ones first.
     """
-    plugins = {point.name: point.value for point in entry_points(group=group_of(kind))}
+    plugins = offered_names(group_of(kind))
     return dict(table) | {name: origin for name, origin in plugins.items() if name not in table}
+
+
+def offered_names(group: str) -> Mapping[str, str]:
+    """Return the entry points that installed packages offer in a group, name -> "module:object"."""
+    return _offered_names(group, tuple((entry, _modification_time(entry)) for entry in sys.path))
+
+
+@lru_cache(maxsize=256)
+def _offered_names(group: str, _search_path: tuple[tuple[str, int], ...]) -> dict[str, str]:
+    # Each call reads the metadata of all installed packages. What is installed or removed changes its folder.
+    return {point.name: point.value for point in entry_points(group=group)}
+
+
+def _modification_time(entry: str) -> int:
+    """Return when a folder of the import path changed, ns; 0 where there is none."""
+    try:
+        return os.stat(entry or os.curdir).st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _import(kind: str, name: str, target: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -52,11 +53,15 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
     is_installed = base.name in INSTALLED
     files_by_module: dict[str, Path] = {}
     queue = [module]
+    visited, listed = set[str](), set[str]()  # names that are done, and packages whose modules are in the queue
     while queue:
         name = queue.pop()
+        if name in visited:  # most names come up dozens of times, and each costs a look at the disk
+            continue
+        visited.add(name)
         path = None if is_installed and name.partition(".")[0] != top else _file(base, name)
         skipped = any(name == excluded or name.startswith(f"{excluded}.") for excluded in excluded_modules)
-        if skipped or name in files_by_module or path is None:
+        if skipped or path is None:
             continue
         files_by_module[name] = path
         parent = name.rpartition(".")[0]
@@ -76,13 +81,10 @@ def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[s
                 else [f"{top}.{imported_name}" for imported_name in imported_names]
             )
         for text in module_strings:
+            if text.startswith(f"{top}.") and text not in listed:
+                listed.add(text)
+                queue += [f"{text}.{imported.stem}" for imported in (base / Path(*text.split("."))).glob("[!_]*.py")]
             queue.append(text)
-            package_folder = base / Path(*text.split("."))
-            queue += (
-                [f"{text}.{imported.stem}" for imported in package_folder.glob("[!_]*.py")]
-                if text.startswith(f"{top}.")
-                else []
-            )
     return files_by_module
 
 
@@ -117,10 +119,10 @@ def _is_built_in(module: str) -> bool:
 
 def _file(base: Path, name: str) -> Path | None:
     """Return the file of a module below a folder."""
-    path = base / Path(*name.split("."))
-    for candidate in (path.with_name(path.name + ".py"), path / "__init__.py"):
-        if candidate.is_file():
-            return candidate
+    path = os.path.join(base, *name.split("."))
+    for candidate in (f"{path}.py", os.path.join(path, "__init__.py")):
+        if os.path.isfile(candidate):
+            return Path(candidate)
     return None
 
 

@@ -220,6 +220,15 @@ def test_a_walker_waits_before_a_vehicle_that_blocks_the_crossing() -> None:
     assert not drive.touched
 
 
+@pytest.mark.parametrize("driver", [None, CALM])
+def test_a_vehicle_with_its_nose_on_the_crossing_lets_who_crosses_pass(driver: DriverStyle | None) -> None:
+    standing = replace(car(-1.3, 0.0, Controller.AUTOPILOT, driver), target_speed=9.0)
+    drive = Drive(ZEBRA, walker(y=3.5 - 5.0), standing, seconds=15.0)
+    assert not drive.touched
+    assert drive.pose[-1, 1, 1] > NORTH
+    assert drive.pose[-1, 2, 0] > AT + 10.0
+
+
 def test_a_group_waits_and_crosses_together() -> None:
     group = [
         walker(1, x=AT - 0.35, depth=1.0),

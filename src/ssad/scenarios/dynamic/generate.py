@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.metadata import entry_points
 from typing import Any, cast
 
 import numpy as np
@@ -25,7 +24,7 @@ from ssad.core.driving import (
 from ssad.core.errors import ConfigError, MissingExtraError, SSADError
 from ssad.core.generators import Base, Generator, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.registry import Reference, check_arguments, names, resolve
+from ssad.core.registry import Reference, check_arguments, names, offered_names, resolve
 from ssad.core.traces import merge_steps
 from ssad.core.types import AgentKind, Bool, Controller, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
@@ -76,7 +75,7 @@ def generator_factory(name: str) -> GeneratorFactory:
         ConfigError: It cannot be imported, or cannot be called.
     """
     prefix, _, file = name.partition(":")
-    if file and prefix in entry_points(group=FILE_GENERATORS).names:
+    if file and prefix in offered_names(FILE_GENERATORS):
         return cast(GeneratorFactory, resolve("generator_file", {}, prefix)(file))
     reference = Reference.parse(name)
     resolved = resolve("generator", GENERATORS, reference.name)

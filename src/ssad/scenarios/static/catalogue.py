@@ -22,7 +22,6 @@ import sys
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
@@ -31,7 +30,7 @@ from pydantic import BeforeValidator, Field, model_serializer, model_validator
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.registry import Reference, make, resolve
+from ssad.core.registry import Reference, make, offered_names, resolve
 from ssad.core.schema import Schema
 from ssad.scenarios.static.perturbation import Perturbation
 
@@ -427,7 +426,7 @@ def _registered(search_path: tuple[str, ...]) -> Mapping[str, str]:
 
     names: dict[str, str] = {}
     for family, group in GROUPS.items():
-        names |= {entry_point.name: family for entry_point in entry_points(group=f"ssad.{group}s")}
+        names |= dict.fromkeys(offered_names(f"ssad.{group}s"), family)
     names |= dict.fromkeys((*CONTROLS, *shipped_textures()), "texture")
     names |= dict.fromkeys((name for name in ATTACKS if not needs(name)), "digital")
     names |= dict.fromkeys((NIGHT, *LIGHTS), "light")

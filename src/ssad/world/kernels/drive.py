@@ -32,9 +32,10 @@ from ssad.world.kernels.drivers import (
     pedal_change,
 )
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
-from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
+from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, lane_under, row, wrap
 
 MOVES = wp.constant(0.5)  # m/s
+BACK_STEP = wp.constant(1.0)  # m
 BEHIND = wp.constant(20.0)  # m
 HALTED = wp.constant(0.1)  # m/s
 NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
@@ -171,17 +172,21 @@ def room_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_ro
 
 
 @wp.func
-def is_calm_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_row: int) -> bool:
-    """Return whether nobody moves in the half circle behind a vehicle that is about to back out."""
+def may_back_out(
+    roads: Roads, perceived: PerceivedAgents, b: int, i: int, town: int, from_row: int, to_row: int
+) -> bool:
+    """Return whether a vehicle stays on the road if it backs out, and nobody moves in the half circle behind it."""
     pose = perceived.pose[b, i]
-    calm = bool(True)
+    c = wp.cos(pose[2])
+    s = wp.sin(pose[2])
+    may = lane_under(roads, town, pose[0] - BACK_STEP * c, pose[1] - BACK_STEP * s)[0] >= 0.0
     for j in range(from_row, to_row):
         if j != i and perceived.kind[b, j] != AgentKind.NONE and wp.abs(perceived.speed[b, j]) > MOVES:
             dx = perceived.pose[b, j][0] - pose[0]
             dy = perceived.pose[b, j][1] - pose[1]
-            if dx * wp.cos(pose[2]) + dy * wp.sin(pose[2]) < 0.0 and dx * dx + dy * dy < BEHIND * BEHIND:
-                calm = bool(False)
-    return calm
+            if dx * c + dy * s < 0.0 and dx * dx + dy * dy < BEHIND * BEHIND:
+                may = bool(False)
+    return may
 
 
 @wp.func
@@ -246,7 +251,7 @@ def drive_one(
                 from_row = agents
                 to_row = rows
             if room_behind(perceived, b, i, from_row, to_row) and (
-                not has_driver or is_calm_behind(perceived, b, i, from_row, to_row)
+                not has_driver or may_back_out(roads, perceived, b, i, bank.town[e], from_row, to_row)
             ):
                 throttle = 0.0
                 if speed > -1.0:

@@ -32,15 +32,17 @@ from ssad.world.kernels.overtake import (
     QUEUE,
     RAMP_LEAST,
     RAMP_TIME,
+    VIEW,
     choose_lane,
     end_of_block,
     examine_lane,
     passing_time,
+    place_beside,
     should_abort_passing,
     vec7,
     way_is_clear,
 )
-from ssad.world.kernels.shared import row
+from ssad.world.kernels.shared import route_frame, row
 from ssad.world.kernels.traffic import line_ahead, stop_before
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
@@ -55,6 +57,10 @@ SLOWER = wp.constant(0.8)  # m/s: who is hardly slower is not passed
 SLOWS = wp.constant(-0.7)  # m/s^2: who brakes for something ahead is not passed
 CLEARS = wp.constant(6.0)  # m ahead of whoever it has passed from which a driver returns
 NEARS = wp.constant(0.35)  # share of the difference of speeds that is lost meanwhile
+QUEUE_SPEED = wp.constant(3.0)  # m/s of whoever waits, or comes to it
+STARTS = wp.constant(3.0)  # m/s: slower, a change begins almost from rest
+PICKS_UP = wp.constant(1.0)  # m/s^2 of whoever starts behind
+LEAST_LENGTH = wp.constant(8.0)  # m of a change, of two-wheelers, too
 COMES_UP = wp.constant(8.0)  # s: nobody returns behind somebody slower whom it would soon come up with
 
 
@@ -107,6 +113,40 @@ def follower_loss(lane_gaps: vec7, speed: float, length: float, style: wp.vec4) 
 
 
 @wp.func
+def has_queue_ahead(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    leader: int,
+    e: int,
+    rows: wp.vec2i,
+    reach: float,
+) -> bool:
+    """Return whether somebody but the leader is slow or stands on i's lane within `reach` m: there is no way back."""
+    route = bank.route[e, i]
+    u0 = state.aim[b, i][0]
+    pose = state.pose[b, i]
+    own_body = bank.body[bank.model[e, i]]
+    frame = route_frame(roads, route[0], route[1], u0)
+    queue = bool(False)
+    for j in range(rows[0], rows[1]):
+        if j != i and j != leader and perceived.kind[b, j] != AgentKind.NONE and perceived.speed[b, j] < QUEUE_SPEED:
+            other_pose = perceived.pose[b, j]
+            dx = other_pose[0] - pose[0]
+            dy = other_pose[1] - pose[1]
+            if dx * dx + dy * dy < reach * reach:
+                position = place_beside(roads, route, u0, dx * frame[2] + dy * frame[3], other_pose)
+                width = own_body[1] + perceived.half[b, j][1]
+                ahead = position[0] > 0.0 and position[0] < reach and position[3] < 1.0
+                if ahead and position[2] > 0.5 and wp.abs(position[1]) < width:
+                    queue = bool(True)
+    return queue
+
+
+@wp.func
 def return_to_route(
     bank: EpisodeArrays,
     roads: Roads,
@@ -131,7 +171,7 @@ def return_to_route(
     courtesy = bank.courtesy[e, i]
     own_body = bank.body[bank.model[e, i]]
     adjacent_lanes = row(roads.beside, route_point)
-    shortest = 2.0 * RAMP_LEAST * own_body[0]
+    shortest = wp.max(2.0 * RAMP_LEAST * own_body[0], LEAST_LENGTH)
     leads_on = wp.abs(adjacent_lanes[1]) - offset
     if shift[3] < 0.0:
         leads_on = adjacent_lanes[3] - offset
@@ -153,7 +193,12 @@ def return_to_route(
     lead = wp.clamp(length_room - wp.max(shortest, RAMP_TIME * speed), 0.0, delay * speed)
     begins = bool(False)
     if must_return:
-        begins = accepts_gap(lane_gaps, speed, 0.0, wp.max(style[3], -FIRM), style)
+        merge_gaps = lane_gaps
+        if speed < STARTS:
+            # until it has come in from rest, whoever is behind may have started, too
+            merge_gaps[6] = merge_gaps[6] + PICKS_UP * SIGNALS
+            merge_gaps[5] = merge_gaps[5] - 0.5 * PICKS_UP * SIGNALS * SIGNALS
+        begins = accepts_gap(merge_gaps, speed, lead / wp.max(speed, STARTS), wp.max(style[3], -FIRM), style)
     elif accepts_gap(lane_gaps, speed, delay, style[3], style):
         present_gap = FAR
         present_speed = float(0.0)
@@ -170,12 +215,12 @@ def return_to_route(
         passing_gaps = examine_lane(bank, roads, state, perceived, b, i, e, rows, shift[3], speed, 0.0, 0.0)
         gain = gain - courtesy[0] * follower_loss(passing_gaps, speed, 2.0 * own_body[0], style)
         begins = not comes_up and gain >= THRESHOLD - BIAS
-    if begins and length_room >= shortest:
+    if begins and front_room >= shortest:
         change_length = wp.clamp(length_room - lead, shortest, change_length)
         lanes = lanes_left(shift, u0)
         state.shift[b, i] = wp.vec4(u0 + lead, u0 + lead + change_length, lanes, 0.0)
     elif must_return and not oncoming:
-        stop = leads_on - own_body[0] - shortest
+        stop = leads_on - own_body[0] - shortest - 2.0
         if stop < 4.0 * speed + 20.0:
             state.react[b, i] = wp.min(state.react[b, i], stop_before(speed, stop, style))
 
@@ -237,7 +282,10 @@ def pass_leader(
         advantage = driver_accelerates(speed, top, style) - present
         if advantage < THRESHOLD + BIAS:
             return
-    shortest = 2.0 * RAMP_LEAST * own_body[0]
+        reach = wp.min(VIEW, line)
+        if has_queue_ahead(bank, roads, state, perceived, b, i, j, e, rows, reach):
+            return
+    shortest = wp.max(2.0 * RAMP_LEAST * own_body[0], LEAST_LENGTH)
     duration = courtesy[1]
     # a driver that comes up with somebody loses some speed until it is past
     closing = wp.max(speed - wp.max(other_speed, 0.0), 0.0)

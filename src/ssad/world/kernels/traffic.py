@@ -76,6 +76,8 @@ SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per sq
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
+JAMMED = wp.constant(45.0)  # s after which a driver makes room behind somebody who stands in a junction
+CLOSED_UP = wp.constant(3.0)  # m
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
@@ -105,6 +107,8 @@ STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in th
 JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
 ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+HOLDS = wp.constant(0.3)  # share of its acceleration, and m/s^2
+DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a driver that relies on somebody waits
 WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
 AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
@@ -798,7 +802,8 @@ def driver_gives_way(
     react = wp.max(stop, comes_after)
     if speed * end < meeting.near:
         react = wp.max(react, -style[3] - power)  # it has passed by then in any case
-    stops = (other_speed < CREEPS and other_accel < -0.1) or (other_speed < TURNS and other_accel < -BRAKES)
+    # the other one stops if it goes on to brake a little harder than now
+    stops = other_accel < -0.1 and other_speed < TURNS and other_speed < 2.0 * (BRAKES - other_accel) * meeting.begin
     stands = other_speed < WAITING and other_accel < STARTS
     if goes_first and ((stops and other_need < STILL_STOPS) or (stands and other_need < RELIES)):
         return 0.0  # the other one stops already, or waits
@@ -810,7 +815,8 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            if is_there or parallel or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            is_ahead = lead < -JOINS and goes_first
+            if is_there or parallel or is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
@@ -820,7 +826,14 @@ def driver_gives_way(
     if goes_first and other_need < WARY:
         return 0.0  # the other one can stop
     if goes_first and other_need < RELIES:
-        return -power  # it should, but who knows: the driver gains no speed
+        return -power - DOUBTS * style[3]  # it should, but does not yet
+    if speed < LETS_BELOW and comes_after < -HOLDS * power:
+        react = wp.min(react, -power - HOLDS)  # it does not start only to stop again
+    if meeting.near < ENTERED and speed > LETS_BELOW and not is_there:
+        # in the stretch already, it goes on if it leaves it in time
+        sooner = meeting.begin
+        if wp.min(speed * sooner + 0.5 * power * sooner * sooner, state.aim[b, i][1] * sooner) > meeting.far:
+            return 0.0
     need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
     if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
         return 0.0  # most of the stretch lies behind
@@ -974,6 +987,14 @@ def react_to_agents(
                         state.stalled[b, i] = 1
                     elif not room_behind(perceived, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
+                if (
+                    style[0] > 0.0
+                    and leads == 1
+                    and leader[0] < CLOSED_UP
+                    and wp.min(state.waited[b, i], perceived.waited[b, j]) > JAMMED
+                    and perceived.way[b, j][1] < other_half[0] + 0.5
+                ):
+                    state.stalled[b, i] = 1  # makes room for somebody who may have to back out of the junction
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
                 # a driver of the population does not brake hard for it

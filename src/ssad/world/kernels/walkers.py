@@ -57,6 +57,8 @@ HURRY = wp.constant(1.5)  # times its speed, at which a walker gets out of the w
 PICKS_UP = wp.constant(1.5)  # m/s^2 that a driver expects of itself
 CLEARS = wp.constant(0.7)  # s between a walker and the vehicle that comes after it
 PASSES = wp.constant(1.5)  # s between a vehicle and the walker that comes after it
+SLOW_ENOUGH = wp.constant(1.5)  # m/s
+FRONT = wp.constant(1.0)  # m of a crossing before a vehicle that stands on it, which are room enough to walk past
 TOUCHES = wp.constant(0.4)  # m from a vehicle's side to the middle of a walker before which it does not move
 COMFORT = wp.constant(2.0)  # m/s^2 with which a driver brakes for a walker who waits
 LINE = wp.constant(0.3)  # m less than its gap at rest, at which a driver stops before a crossing
@@ -219,8 +221,8 @@ def lets_cross(
     if speed < STANDS:
         return yields == 1 or waited > 1.0
     if speed * speed > 2.0 * FORCED * wp.max(place[0] - 0.3, 0.0):
-        # too fast to stop for anybody
-        return place[1] / speed + 1.0 < entry_time
+        # too fast to stop for anybody, and past before the walker comes
+        return place[1] / speed + PASSES + 0.5 < entry_time
     gap_time = arrival(place[0], speed, GAINS)
     if gap_time > exit_time + margin:
         return True
@@ -420,7 +422,10 @@ def make_way(
                             follows = wp.max(other_speed, 0.0) + 0.8 * wp.max(gap - 0.1, 0.0)
                             limit = wp.min(limit, wp.max(follows, least))
                     elif is_blocked:
-                        limit = wp.min(limit, wp.sqrt(SLOWS * wp.max(gap - 0.4, 0.0)))
+                        least = float(0.0)
+                        if wp.abs(beside) > half_across and wp.abs(state.speed[b, other]) < 0.2:
+                            least = wp.min(wish, SQUEEZES)  # along the side of a vehicle that stands
+                        limit = wp.min(limit, wp.max(wp.sqrt(SLOWS * wp.max(gap - 0.4, 0.0)), least))
     place = wp.clamp(0.0, low, high)
     if low > high:
         place = 0.5 * (low + high)
@@ -667,8 +672,14 @@ def yield_one(
                     ):
                         stops = bool(False)
                         if walk.status[b, j] == WalkStatus.CROSSING:
-                            # who is on the crossing already leaves it, but for somebody right before it
+                            # who is on the crossing leaves it, unless somebody is about to walk past its front
                             stops = near > -NOSE or way - body[1] < TOUCHES
+                            if not stops and speed < SLOW_ENOUGH:
+                                stops = rear - 2.0 * body[0] > FRONT
+                            # who is too late to stop goes on if it is past before the walker comes
+                            if speed * speed > 2.0 * FORCED * wp.max(near, 0.1) and speed > SLOW_ENOUGH:
+                                if entry_time > rear / speed + 0.3:
+                                    stops = bool(False)
                         elif form[3] > 0.5 or numbers[1] == 1:
                             stops = near > 0.3 and speed * speed < 2.0 * comfort * wp.max(near - 0.5, 0.1)
                         if stops:
