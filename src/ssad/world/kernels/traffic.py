@@ -28,9 +28,11 @@ from ssad.world.kernels.data import (
 )
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
+    BEYOND_LINE,
     CREEPS,
     FIRM,
     RUNS_RED,
+    STAYS_BELOW,
     STOPS_AT_YELLOW,
     YIELD_LEAST,
     driver_arrives_after,
@@ -562,7 +564,10 @@ def scan_agents(
             react = stops_early(bank, state, b, i, e, speed, line_gap + 1.0)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < sight + 20.0:
+        passed = float(-0.5)
+        if style[0] > 0.0 and signal_now == SignalState.RED and speed < STAYS_BELOW:
+            passed = -BEYOND_LINE
+        if line_gap > passed and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
