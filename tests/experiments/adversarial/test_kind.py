@@ -141,9 +141,9 @@ def test_candidates_alone_are_driven_again_and_graded(monkeypatch: pytest.Monkey
         driven.extend(episodes)
         return [replay(), replay(), replay(end="complete")]
 
-    graded = [SimpleNamespace(metrics=lambda: AVOIDED), SimpleNamespace(metrics=lambda: dict.fromkeys(AVOIDED, 0.0))]
+    avoiders = [{"cc": True, "rss": False}, {"cc": False, "rss": False}]
     monkeypatch.setattr("ssad.scenarios.dynamic.generate.scenario_of", lambda outcome, base, name: outcome)
-    monkeypatch.setattr("ssad.simulators.closed_loop.grades_of", lambda drives, device: graded[: len(drives)])
+    monkeypatch.setattr("ssad.simulators.proofs.avoiders_of", lambda drives, device: avoiders[: len(drives)])
     trials: Any = SimpleNamespace(bases=drive_again, device="cpu")
     assert proven_bases(bases, rows, trials, limit=1) == [True, False, False, False]
     assert [(outcome, seed) for outcome, _, seed in driven] == [(rows[k][0], 8) for k in (0, 2, 3)]
