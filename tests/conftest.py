@@ -138,12 +138,12 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
 
 @pytest.fixture(scope="session")
 def recorded(shared: Shared) -> Path:
-    """What `ssad record` writes: a second in Twinford (train) and one in Oldmarket (val), by a process each."""
+    """What `ssad record` writes: a second in Twinford (train) and one in Oldmarket (val)."""
     from ssad.recorders.nuscenes import Recording, record_nuscenes
 
     def make(out: Path) -> None:
         towns = ("Twinford", "Oldmarket")
-        record_nuscenes(Recording(out, towns, towns[1:], scenes=1, seconds=1.0, width=160, sweeps=1), workers=2)
+        record_nuscenes(Recording(out, towns, towns[1:], scenes=1, seconds=1.0, width=160, sweeps=1), workers=0)
 
     return shared("recorded", make)
 

@@ -72,7 +72,7 @@ def drives(count: int) -> Transitions:
 
 @pytest.fixture(scope="module")
 def region() -> FeasibleRegion:
-    recipe = RegionRecipe(steps=1500, batch=256, hidden=(32,), lr=5e-3, gamma=0.9, unsafe=2.0, tau=0.05)
+    recipe = RegionRecipe(steps=800, batch=128, hidden=(32,), lr=1e-2, gamma=0.9, unsafe=10.0, tau=0.1)
     return train_region(drives(4000), recipe)
 
 

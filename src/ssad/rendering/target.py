@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import BODIES, PAINTS, make_body
 from ssad.rendering.meshes.mesh import Mesh, Point
+
+
+@lru_cache(maxsize=16)
+def _mesh(kind: str, style: str, size: Point, key: str, seed: int) -> Mesh:
+    # A suite asks for the same body dozens of times.
+    return make_body(kind, style=style, size=size, generator=generator(key, style, seed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +51,8 @@ class TargetCar:
         return PAINTS[self.paint]
 
     def mesh(self) -> Mesh:
-        """Build its body."""
-        rng = generator("target car", self.style, self.seed)
-        return make_body("car", style=self.style, size=self.full_size, generator=rng)
+        """Return its body, which all who ask share."""
+        return _mesh("car", self.style, self.full_size, "target car", self.seed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +87,9 @@ class _StandingTarget:
         return (0.5, 0.5, 0.5)
 
     def mesh(self) -> Mesh:
-        """Build its body; that of a sign has plate and post."""
+        """Return its body, which all who ask share; that of a sign has plate and post."""
         noun = "sign" if self.kind == "stop_sign" else self.kind
-        rng = generator(f"target {noun}", self.style, self.seed)
-        return make_body(self.kind, style=self.style, size=self.full_size, generator=rng)
+        return _mesh(self.kind, self.style, self.full_size, f"target {noun}", self.seed)
 
 
 @dataclass(frozen=True, slots=True)

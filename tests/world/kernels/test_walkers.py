@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
@@ -30,6 +31,7 @@ from ssad.core.types import (
 )
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.kernels.data import WalkStatus
+from ssad.world.kernels.walkers import lets_cross
 from ssad.world.roads import load_town
 from ssad.world.roads.crossings import road_crossings
 from ssad.world.roads.sidewalks import sidewalk_network
@@ -177,6 +179,42 @@ def test_a_walker_accepts_the_gap_in_which_it_crosses_with_its_margin(margin: fl
         assert math.isfinite(drive.entered(1))
 
 
+@wp.kernel(enable_backward=False)
+def ask(rows: wp.array2d(dtype=wp.float32), answers: wp.array(dtype=wp.int32)):
+    row = wp.tid()
+    place = wp.vec4(rows[row, 0], rows[row, 1], 0.0, 0.0)
+    answers[row] = 0
+    if lets_cross(
+        place, rows[row, 2], rows[row, 3], rows[row, 4], rows[row, 5], rows[row, 6], 1.25, 0.5, 2.0, int(rows[row, 7])
+    ):
+        answers[row] = 1
+
+
+@pytest.mark.parametrize(
+    ("values", "answer"),
+    [
+        # m to the front, m until the rear has left; speed, acceleration, s of rest; m to enter and leave; has to yield
+        ((12.0, 20.0, 10.0, -5.0, 0.0, 0.5, 4.5, 1), False),  # brakes, but could not stop with 3 m/s^2
+        ((25.0, 33.0, 8.0, 0.0, 0.0, 0.5, 4.5, 1), True),  # can stop with 2 m/s^2
+        ((25.0, 33.0, 8.0, 0.0, 0.0, 0.5, 4.5, 0), False),  # does not have to, and the gap of 2.8 s is too short
+        ((12.0, 20.0, 6.0, -1.8, 0.0, 0.5, 4.5, 1), True),  # slows down and will stop before it
+        ((66.0, 74.0, 8.0, 0.0, 0.0, 0.5, 4.5, 0), True),  # it may come in 6.3 s; crossing takes 4.1 s, and 2 s more
+        ((0.2, 8.0, 0.0, 0.0, 9.0, 0.5, 4.5, 1), False),  # stands on the crossing
+        ((0.2, 4.0, 5.0, 0.0, 0.0, 6.0, 10.0, 1), True),  # leaves it before the walker comes
+        ((5.0, 12.0, 10.0, 0.0, 0.0, 6.0, 10.0, 1), True),  # too fast to stop, and past 2 s before
+        ((5.0, 12.0, 10.0, 0.0, 0.0, 2.0, 6.0, 1), False),
+        ((5.0, 12.0, 0.0, 0.0, 0.2, 0.5, 4.5, 0), False),  # has only just stopped
+        ((5.0, 12.0, 0.0, 0.0, 2.0, 0.5, 4.5, 0), True),
+        ((5.0, 12.0, 10.0, 0.0, 0.0, -4.0, -0.5, 1), True),  # the walker is beyond its way
+    ],
+)
+def test_a_vehicle_lets_a_walker_enter_the_road(values: tuple[float, ...], answer: bool) -> None:
+    answers = wp.zeros(1, dtype=wp.int32, device="cpu")
+    rows = wp.array(np.array([values], np.float32), dtype=wp.float32, device="cpu")
+    wp.launch(ask, 1, [rows, answers], device="cpu")
+    assert bool(answers.numpy()[0]) == answer
+
+
 def test_nobody_steps_in_front_of_a_vehicle_that_cannot_stop() -> None:
     for distance in (4.0, 10.0, 16.0):  # from 10 m/s it would have to brake with more than 3 m/s^2
         drive = Drive(ZEBRA, walker(), car(distance, 10.0), seconds=8.0)
@@ -307,14 +345,20 @@ def crossing_walkers(built: Episode, steps: list[dict[str, Any]]) -> list[tuple[
     return entries
 
 
-def test_walkers_cross_on_red_for_the_traffic_that_they_cross(crowd: Any) -> None:
+def test_walkers_cross_while_the_traffic_that_they_cross_has_red(crowd: Any) -> None:
     built, steps, _ = crowd
     at_signals = 0
-    for step, _, crossing in crossing_walkers(built, steps):
-        traffic = road_crossings(TOWN)[crossing.crossing].traffic
-        for part in traffic:
+    for step, agent, crossing in crossing_walkers(built, steps):
+        road = road_crossings(TOWN)[crossing.crossing]
+        for part in road.traffic:
+            way = part.high - road.kerbs[0] if crossing.forward else road.kerbs[1] - part.low
+            beyond = np.array([other["walk.rail"][agent, 0] > crossing.kerb + way for other in steps[step:]])
+            until = step + int(beyond.argmax()) if beyond.any() else len(steps)
+            # vehicles need some time after green to come there
+            lights = [other["light"][part.signal] for other in steps[step : until - round(10 * part.seconds)]]
+            assert all(light == SignalState.RED for light in lights)
             assert steps[step]["light"][part.signal] == SignalState.RED
-        at_signals += bool(traffic)
+        at_signals += bool(road.traffic)
     assert at_signals >= 2
 
 

@@ -16,6 +16,8 @@ wp.set_module_options({"max_unroll": 0})  # see `traffic`
 LEADER_BRAKES = wp.constant(4.0)  # m/s^2 that a driver reckons a leader may brake with
 STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Rothery 1962: between 2.44 and 3.66)
 RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
+BEYOND_LINE = wp.constant(2.0)  # m beyond the stop line, within which who has come to rest waits for green
+STAYS_BELOW = wp.constant(1.5)  # m/s: who is slower beyond the line, stays
 SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
 FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
 RELEASE = wp.constant(1.8)  # times the ordinary jerk, with which the foot leaves the throttle to brake

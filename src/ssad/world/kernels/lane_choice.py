@@ -60,6 +60,7 @@ NEARS = wp.constant(0.35)  # share of the difference of speeds that is lost mean
 QUEUE_SPEED = wp.constant(3.0)  # m/s of whoever waits, or comes to it
 STARTS = wp.constant(3.0)  # m/s: slower, a change begins almost from rest
 PICKS_UP = wp.constant(1.0)  # m/s^2 of whoever starts behind
+LONG_WAIT = wp.constant(15.0)  # s
 LEAST_LENGTH = wp.constant(8.0)  # m of a change, of two-wheelers, too
 COMES_UP = wp.constant(8.0)  # s: nobody returns behind somebody slower whom it would soon come up with
 
@@ -195,9 +196,12 @@ def return_to_route(
     if must_return:
         merge_gaps = lane_gaps
         if speed < STARTS:
-            # until it has come in from rest, whoever is behind may have started, too
-            merge_gaps[6] = merge_gaps[6] + PICKS_UP * SIGNALS
-            merge_gaps[5] = merge_gaps[5] - 0.5 * PICKS_UP * SIGNALS * SIGNALS
+            # until it has come in from rest, whoever is behind may have started, too; who has waited long risks more
+            pick_up = float(PICKS_UP)
+            if state.waited[b, i] > LONG_WAIT:
+                pick_up = 0.4 * PICKS_UP
+            merge_gaps[6] = merge_gaps[6] + pick_up * SIGNALS
+            merge_gaps[5] = merge_gaps[5] - 0.5 * pick_up * SIGNALS * SIGNALS
         begins = accepts_gap(merge_gaps, speed, lead / wp.max(speed, STARTS), wp.max(style[3], -FIRM), style)
     elif accepts_gap(lane_gaps, speed, delay, style[3], style):
         present_gap = FAR

@@ -28,9 +28,11 @@ from ssad.world.kernels.data import (
 )
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
+    BEYOND_LINE,
     CREEPS,
     FIRM,
     RUNS_RED,
+    STAYS_BELOW,
     STOPS_AT_YELLOW,
     YIELD_LEAST,
     driver_arrives_after,
@@ -562,7 +564,10 @@ def scan_agents(
             react = stops_early(bank, state, b, i, e, speed, line_gap + 1.0)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < sight + 20.0:
+        passed = float(-0.5)
+        if style[0] > 0.0 and signal_now == SignalState.RED and speed < STAYS_BELOW:
+            passed = -BEYOND_LINE
+        if line_gap > passed and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
@@ -810,15 +815,17 @@ def driver_gives_way(
             # where two ways become one, the driver behind makes room; side by side, the one without priority
             if lead > JOINS or (lead > -JOINS and not goes_first):
                 return wp.min(follows, react)
-            is_ahead = lead < -JOINS and goes_first
-            if is_there or parallel or is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+            is_ahead = is_there or parallel or (lead < -JOINS and goes_first)
+            if speed < LETS_BELOW and not goes_first and state.aim[b, i][0] < state.shift[b, i][1]:
+                is_ahead = bool(False)  # who begins to change lanes from rest is not ahead yet
+            if is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
             # it is going to be ahead: an early lift of the foot is enough
             return wp.max(follows, -style[3] - power)
         elif lead > 0.0:
             react = wp.max(react, follows)
-    if goes_first and other_need < WARY:
+    if goes_first and (other_need < WARY or (other_need < RELIES and meeting.near < ENTERED)):
         return 0.0  # the other one can stop
     if goes_first and other_need < RELIES:
         return -power - DOUBTS * style[3]  # it should, but does not yet

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from ssad.core.types import F64
 from ssad.world.roads.query import LaneQuery
@@ -22,6 +21,8 @@ def edge_raster(query: LaneQuery, points: F64) -> tuple[F64, F64]:
     Returns:
         Distances [rows, columns], m: y and x grow with them; place of the first one [2], m.
     """
+    from scipy.ndimage import distance_transform_edt  # every process loads towns, few ask for distances
+
     origin: F64 = np.floor(points.min(0) - MARGIN)
     shape = np.ceil((points.max(0) + MARGIN - origin) / CELL).astype(int) + 1
     x, y = (origin[axis] + CELL * np.arange(shape[axis]) for axis in (0, 1))
@@ -34,5 +35,7 @@ def edge_raster(query: LaneQuery, points: F64) -> tuple[F64, F64]:
 
 def edge_distances(query: LaneQuery, points: F64) -> F64:
     """Return signed distances [n] of points [n, 2] from the road's edge, m, positive off it; linear in between."""
+    from scipy.ndimage import map_coordinates
+
     raster, origin = edge_raster(query, points)
     return np.asarray(map_coordinates(raster, ((points - origin) / CELL).T[::-1], order=1), np.float64)

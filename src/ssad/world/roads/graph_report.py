@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
@@ -42,6 +41,8 @@ def describe(graph: LaneGraph, roads: str, report: ImportReport, place: Callable
     if not len(starts):
         return
     start_points, end_points = graph.offset[:-1], graph.offset[1:] - 1
+    from scipy.spatial import cKDTree  # every process loads towns, few import maps
+
     beside = cKDTree(graph.xy[start_points[starts]]).query_ball_point(graph.xy[end_points[lanes]], BESIDE)
     for lane, rows in zip(lanes.tolist(), beside, strict=True):
         for start in starts[rows].tolist():

@@ -53,7 +53,8 @@ def test_the_batch_changes_no_bit() -> None:
 
     def drive(*chosen):
         world = World(chosen, {TOWN.name: TOWN})
-        return [trace_hash(t) for t in rollout(world, {0: make_system("blind"), FreaSelection(): Adversary(name="adv-ppo-paper")})]
+        drivers = {0: make_system("blind"), FreaSelection(): Adversary(name="adv-ppo-paper")}
+        return [trace_hash(trace) for trace in rollout(world, drivers)]
 
     together = drive(*episodes)
     assert [drive(one)[0] for one in episodes] == together
