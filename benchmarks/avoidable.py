@@ -40,7 +40,8 @@ from ssad.metrics import CaseValue, estimate
 from ssad.metrics.driving import first_contact
 from ssad.scenarios.dynamic.generate import Trials, scenario_of
 from ssad.scenarios.dynamic.policy.adv_ppo import Adversary
-from ssad.training.adversary import AdversaryPlan, run_adversary_training
+from ssad.simulators.proofs import prove_collisions
+from ssad.training.adversary import ROAD_COST, AdversaryPlan, run_adversary_training
 from ssad.world.roads import load_town
 from ssad.world.selection import FreaSelection, Note
 
@@ -153,11 +154,12 @@ def run(trial: Trial) -> dict[str, Any]:
         for module in ("adversary", "adversary_env"):
             stack.enter_context(patch(f"ssad.training.{module}.FreaSelection", lambda count: selection))
         if trial.plan is None:
-            driver: Driver = Adversary()
+            driver: Driver = Adversary(name="adv-ppo-paper")
         else:
             out = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            list(run_adversary_training(AdversaryPlan("adv-ppo", out, test=(), **trial.plan), report=lambda _: None))
-            driver = Adversary(out / "adv-ppo.safetensors")
+            plan = AdversaryPlan("adv-ppo-paper", out, test=(), **{"off_road": ROAD_COST} | trial.plan)
+            list(run_adversary_training(plan, report=lambda _: None))
+            driver = Adversary(out / "adv-ppo-paper.safetensors")
         return {ego: measure(driver, selection, ego) for ego in EGOS}
 
 
@@ -165,19 +167,24 @@ def measure(driver: Driver, selection: FreaSelection, ego: str) -> dict[str, Any
     """What an adversary does to an ego.
 
     Returns:
-        Of each scenario that the ego survives as it is: whether it collides with anybody and whether with an adversary
-        that stayed on the road and hit nobody else; and of each such collision that happens again in the saved
-        scenario: whether R157 avoids it, whether the ego moves, how far ahead of the ego the other is, m, and by how
-        much its heading differs, rad.
+        Of each scenario that the ego survives as it is: whether it collides with anybody, whether with an adversary
+        that stayed on the road and hit nobody else, and whether that is proven; and of each such collision that
+        happens again in the saved scenario: whether R157 avoids it, whether the ego moves, how far ahead of the ego
+        the other is, m, and by how much its heading differs, rad.
     """
     trials = Trials(lambda: make_system(ego), policies=make_system)
     graphs = {town: load_town(town) for town in TOWNS}
     bases = trials.bases([(s, graphs[s.town], SEED + k) for k, s in enumerate(held_out())])
     alive = [base for base in bases if base.trace.end != "collision"]
     found = trials.run([(base, Proposal(base.scenario, drivers={selection: driver})) for base in alive])
+    proofs = prove_collisions(list(zip(alive, found, strict=True)), trials)
     rows = {
-        base.scenario.name: [float(o.trace is not None and o.trace.end == "collision"), float(o.is_valid)]
-        for base, o in zip(alive, found, strict=True)
+        base.scenario.name: [
+            float(o.trace is not None and o.trace.end == "collision"),
+            float(o.is_valid),
+            float(proven),
+        ]
+        for base, o, proven in zip(alive, found, proofs, strict=True)
     }
     made = [
         (scenario_of(o, base, name=base.scenario.name), base.graph, base.episode.seed + 1)
@@ -240,12 +247,13 @@ def table(data: dict[str, Any]) -> list[str]:
         lines += [
             f"`{ego}`, which survives {survived} of {SCENARIOS} scenarios in plain replay:",
             "",
-            "| Adv.PPO | any collision | CR | graded | R157 avoids | ego moves | hit from behind | oncoming |",
-            "|---|---|---|---:|---|---:|---:|---:|",
+            "| Adv.PPO | proven | any collision | CR | graded | R157 avoids | ego moves | hit from behind | oncoming |",
+            "|---|---|---|---|---:|---|---:|---:|---:|",
         ]
         for name, one in measured.items():
             rows, hits = one["rows"], one["collisions"]
-            parts = [share({who: row[k] for who, row in rows.items()}) for k in (0, 1)]
+            # Trials that were measured before proofs were have two columns.
+            parts = [share({who: row[k] for who, row in rows.items() if len(row) > k}) or "n/a" for k in (2, 0, 1)]
             kinds: Sequence[Any] = [
                 [row[1] for row in hits.values()],
                 [row[2] < -2.0 for row in hits.values()],

@@ -1,10 +1,11 @@
 """What learned drivers do, and what adversaries do to them: the tables of docs/results/drivers.md.
 
 `python -m benchmarks.drivers --sets precrash,natural` measures driving systems, `--adversaries natural,frea` egos with
-and without adversaries; `safebench` and `frea` must have been imported (docs/how-to/import-scenarios.md). Each set is
-kept in benchmarks/results/drivers.json, and `--page` writes the tables of what is there into docs/results/drivers.md
-and adversaries.md. Intervals are of 95 %; a route with all its draws of traffic is a cluster, as in reports, and fewer
-than ten routes have no interval, but the range over them.
+and without adversaries, by proven collisions first; what is kept of the same world and weights is not measured again.
+`safebench` and `frea` must have been imported (docs/how-to/import-scenarios.md). Each set is kept in
+benchmarks/results/drivers.json, and `--page` writes the tables of what is there into docs/results/drivers.md and
+adversaries.md. Intervals are of 95 %; a route with all its draws of traffic is a cluster, as in reports, and fewer than
+ten routes have no interval, but the range over them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import argparse
 import hashlib
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,7 +36,7 @@ from ssad.scenarios.dynamic.policy.adv_ppo import SHIPPED, Adversary
 from ssad.training.driver import draw_episodes, find_scenarios
 from ssad.world.rollout import rollout
 from ssad.world.selection import FreaSelection
-from ssad.world.world import World
+from ssad.world.world import VERSION, World
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "drivers.json"
@@ -70,14 +72,14 @@ def plain(estimated: Estimate) -> dict[str, Any]:
 
 
 def provenance(systems: Sequence[str]) -> dict[str, Any]:
-    """Return commit, torch version and the hash of the weights of what is measured."""
+    """Return commit, versions of torch and of the world, and the hash of the weights of what is measured."""
     commit = subprocess.run(
         ["git", "log", "-1", "--format=%h (%cs)"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
     folders = [ROOT / "src" / "ssad" / "drivers" / "learned" / "weights", SHIPPED]
     files = [folder / f"{system}.safetensors" for folder in folders for system in systems]
     weights = {file.stem: hashlib.sha256(file.read_bytes()).hexdigest()[:12] for file in files if file.is_file()}
-    return {"commit": commit, "torch": torch.__version__.partition("+")[0], "weights": weights}
+    return {"commit": commit, "torch": torch.__version__.partition("+")[0], "world": VERSION, "weights": weights}
 
 
 def rate(values: Sequence[CaseValue], kind: Literal["share", "bounded"]) -> dict[str, Any]:
@@ -111,28 +113,39 @@ def drive(name: str) -> dict[str, Any]:
     return table
 
 
-def attack(name: str, adversaries: Sequence[str]) -> dict[str, Any]:
-    """What each adversary does to each ego in a set, by town."""
+def attack(
+    name: str, adversaries: Sequence[str], table: dict[str, Any], *, keep: Callable[[], None] = lambda: None
+) -> None:
+    """Measure what each adversary does to each ego in a set, by town.
+
+    Args:
+        name: The set.
+        adversaries: Names of shipped adversaries.
+        table: Rows by town, ego and adversary, which are added to; rows that are there are not measured again.
+        keep: Called after each adversary.
+    """
     episodes, graphs = episodes_of(name)
-    table: dict[str, Any] = {}
+    together = " + ".join(sorted(graphs))
+    towns = (*sorted(graphs), together)
+    bases = [Base(e, graphs[e.town], None) for e in episodes]
     for ego in EGOS:
         trials = Trials(lambda ego=ego: make_system(ego), policies=make_system)
-        natural = outcomes(trials, episodes, graphs, {})
-        for adversary in ("", *adversaries):
-            for count in (1, 2) if adversary else (0,):
-                drivers = {FreaSelection(count=count): Adversary(name=adversary)} if adversary else {}
-                found = outcomes(trials, episodes, graphs, drivers) if adversary else natural
-                bases = [Base(e, graphs[e.town], None) for e in episodes]
-                proven = proven_bases(bases, [[o] for o in found], trials, limit=1) if adversary else None
-                for town in (*sorted(graphs), " + ".join(sorted(graphs))):
-                    here = [k for k, e in enumerate(episodes) if town in (e.town, " + ".join(sorted(graphs)))]
-                    parts = ([rows[k] for k in here] for rows in (episodes, found, natural))
-                    row = measured(*parts, None if proven is None else [proven[k] for k in here])
-                    table.setdefault(town, {}).setdefault(ego, {})[f"{adversary} x {count}" if adversary else ""] = row
-                    print(
-                        town, ego, adversary, count, *(f"{key} {text(value)}" for key, value in row.items()), flush=True
-                    )
-    return table
+        natural: list[Outcome] = []
+        for adversary, count in [("", 0), *((adversary, count) for adversary in adversaries for count in (1, 2))]:
+            label = f"{adversary} x {count}" if adversary else ""
+            if label in table.get(together, {}).get(ego, {}):
+                continue
+            natural = natural or outcomes(trials, episodes, graphs, {})
+            drivers = {FreaSelection(count=count): Adversary(name=adversary)} if adversary else {}
+            found = outcomes(trials, episodes, graphs, drivers) if adversary else natural
+            proven = proven_bases(bases, [[o] for o in found], trials, limit=1) if adversary else None
+            for town in towns:
+                here = [k for k, e in enumerate(episodes) if town in (e.town, together)]
+                parts = ([rows[k] for k in here] for rows in (episodes, found, natural))
+                row = measured(*parts, None if proven is None else [proven[k] for k in here])
+                table.setdefault(town, {}).setdefault(ego, {})[label] = row
+                print(town, ego, label, *(f"{key} {text(value)}" for key, value in row.items()), flush=True)
+            keep()
 
 
 def outcomes(trials: Trials, episodes: Sequence[Episode], graphs: Any, drivers: Any) -> list[Outcome]:
@@ -195,7 +208,9 @@ def driver_table(data: dict[str, Any]) -> list[str]:
 
 def adversary_table(data: dict[str, Any]) -> list[str]:
     """Egos and adversaries by town."""
-    head = "| town | ego | adversaries | proven | CR | more than without | collides on the road, hitting nobody else "
+    head = (
+        "| town | ego | adversaries | proven | raw CR | more than without | collides on the road, hitting nobody else "
+    )
     lines = [head + "| adversary leaves its side of the road | published CR |", "|---|---|---|---|---|---|---|---|---|"]
     for towns in data.values():
         for town, egos in towns.items():
@@ -208,7 +223,7 @@ def adversary_table(data: dict[str, Any]) -> list[str]:
                         *(text(row[k]) if adversary else "" for k in ("more", "valid", "off")),
                     ]
                     known = PUBLISHED.get(ego, {}).get(town)
-                    other = f"{known[bool(adversary)]:.2f}" if known and adversary in ("", "adv-ppo x 1") else ""
+                    other = f"{known[bool(adversary)]:.2f}" if known and adversary in ("", "adv-ppo-paper x 1") else ""
                     lines.append(f"| {town} | {ego} | {adversary or 'none'} | {' | '.join(cells)} | {other} |")
     return [*lines, ""]
 
@@ -219,6 +234,11 @@ def page(data: dict[str, Any]) -> None:
         if part in data:
             made = data.get("made", {}).get(part, {})
             insert(f"results/{part}.md", part, [*made_lines(made), *make(data[part])])
+
+
+def store(path: Path, data: dict[str, Any]) -> None:
+    """Write what has been measured."""
+    path.write_text(json.dumps(data, indent=1) + "\n")
 
 
 def made_lines(made: dict[str, Any]) -> list[str]:
@@ -244,11 +264,14 @@ def main() -> None:
     for name in filter(None, given.sets.split(",")):
         data.setdefault("drivers", {})[name] = drive(name)
         data.setdefault("made", {}).setdefault("drivers", {})[name] = provenance(SYSTEMS)
-        given.json.write_text(json.dumps(data, indent=1) + "\n")
+        store(given.json, data)
     for name in filter(None, given.adversaries.split(",")):
-        data.setdefault("adversaries", {})[name] = attack(name, shipped)
-        data.setdefault("made", {}).setdefault("adversaries", {})[name] = provenance([*EGOS, *shipped])
-        given.json.write_text(json.dumps(data, indent=1) + "\n")
+        made, origin = data.setdefault("made", {}).setdefault("adversaries", {}), provenance([*EGOS, *shipped])
+        if {**made.get(name, {}), "commit": ""} != {**origin, "commit": ""}:
+            data.setdefault("adversaries", {})[name] = {}
+        made[name] = origin
+        keep = partial(store, given.json, data)
+        attack(name, shipped, data["adversaries"][name], keep=keep)
     if given.page:
         page(data)
 

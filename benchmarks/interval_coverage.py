@@ -213,15 +213,15 @@ def stream(*key: object) -> np.random.Generator:
 
 
 def natural_sizes() -> F64:
-    """[38] cases on each route of the set `natural`, in ascending order."""
+    """[38] cases on each route of the set `natural-uniform`, in ascending order."""
     from ssad.experiments.scenario_kind import route_key
     from ssad.scenarios.dynamic import load_scenarios
 
-    return np.sort(np.array([*Counter(map(route_key, load_scenarios("natural"))).values()], np.float64))
+    return np.sort(np.array([*Counter(map(route_key, load_scenarios("natural-uniform"))).values()], np.float64))
 
 
 def route_layout(routes: int, natural: F64) -> Clusters:
-    """Routes with unequal numbers of cases: `natural`; `frea`, 15 routes of 10 cases; else twice those of `natural`."""
+    """Routes with unequal numbers of cases: `natural-uniform`; `frea`, 15 of 10; else twice those of the first."""
     if routes == len(natural):
         size = natural
     elif routes == 15:
@@ -309,11 +309,11 @@ def known_effect_limits(sums: F64, layout: Clusters, design_effect: float) -> Co
 
 
 def route_lines(draws: int) -> list[str]:
-    """Coverage and width on routes like those of `natural` and `frea`, as Markdown."""
+    """Coverage and width on routes like those of `natural-uniform` and `frea`, as Markdown."""
     natural = natural_sizes()
     lines = [
         "Routes with unequal numbers of cases, as those of "
-        f"`natural` ({natural.sum():.0f} cases on {len(natural)}) and `frea` (150 on 15).",
+        f"`natural-uniform` ({natural.sum():.0f} cases on {len(natural)}) and `frea` (150 on 15).",
         "The cases of a route are alike by the design effect (beta-binomial). In brackets: the mean width over that",
         "of an oracle that knows the design effect, and over that of one that knows the standard error. A dash: routes",
         "too small for the design effect.",

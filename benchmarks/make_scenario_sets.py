@@ -2,7 +2,8 @@
 
 Routes are searched on the towns' lane graphs: every stretch of road that a class needs (a clear lane, a lane with a
 neighbour, a turn with crossing traffic), then those that lie farthest apart, so that arms, bends and junctions vary.
-Of natural traffic, those draws are taken in which vehicles cross the ego's way; nobody has driven there before.
+Of natural traffic, those draws are taken in which the schedules of vehicles cross that of the ego. No world is needed:
+the choice depends on no driver's outcome and on no rule of the traffic.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.crossing_traffic import crossings
+from benchmarks.crossing_traffic import scheduled_crossings
 from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.safeio import write_atomic
@@ -32,12 +33,20 @@ from ssad.scenarios.dynamic.yamlio import scenario_text
 from ssad.world.roads import load_town
 
 PRECRASH_TOWN = "ProvingGround"
-NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 30, "Crossgate": 45}
-"""Town -> number of junction routes."""
-NATURAL, CROSSING = 150, 2  # scenarios of the set `natural`, as many as FREA has, and the least that cross in each
+NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 34, "Crossgate": 160}
+"""Town -> number of junction routes: all that there are."""
+NATURAL = 150  # scenarios of each natural set, as many as FREA has
+CROSSING = 2  # vehicles and cyclists that cross in each scenario of `natural`: one may be held up by others
+MAX_DRAWS = 40  # draws of traffic that are tried on a route for each scenario
+TRAFFIC = TrafficPlan(intensity=0.6, drivers="population", walkers=16, cyclists=2)
+"""Traffic of the natural sets.
+
+Twice FREA's share of the spawn places: in Crossgate a vehicle on about 70 m of a lane at 8 m/s, which is 400 an hour,
+half of what a lane at a signal can carry. Twinford's blocks have room for half as many. There are about 900 m of
+sidewalk near a route: 16 walkers are about 85 an hour past each point. Two cyclists, so that most scenarios have one.
+"""
 SIGN_TOWNS: Mapping[str, int] = {"Oldmarket": 12, "Larkhill": 12}
 """Town -> number of ways past a stop sign; no detector of ours has learned from pictures of these towns."""
-UNSELECTED = 2  # draws of traffic on each route in the set `natural-unselected`
 TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
 """Learned drivers are trained here, on none of the towns that the other sets are in."""
 LANE_TOWNS = ("Random4", "Random11", "Random13", "Random14", "Random15", "Random20")
@@ -272,49 +281,75 @@ def _approach(graph: LaneGraph, passage: Stretch) -> int:
     return passage.lanes[inside - 1]
 
 
-def natural(graph: LaneGraph, routes: int, repetitions: int) -> list[Scenario]:
-    """Junction routes, each with `repetitions` draws of traffic."""
+def natural(graph: LaneGraph, routes: int, number: int = 0) -> list[Scenario]:
+    """Return the junction routes of a town with draw `number` of traffic, another one in every episode."""
     return [
         Scenario(
-            name=f"natural/{graph.name}_{i:02d}/{k:02d}",
+            name=f"natural/{graph.name}_{i:02d}/{number:02d}",
             type="NaturalJunction",
             town=graph.name,
             route=stretch.points,
-            seed=k,
+            seed=number,
+            traffic=TRAFFIC,
             group=graph.name,
         )
         for i, stretch in enumerate(junction_routes(graph, routes))
-        for k in range(repetitions)
     ]
 
 
-def draws(graph: LaneGraph, routes: int, number: int) -> list[Scenario]:
-    """Draw `number` of traffic on each of a town's junction routes."""
-    return [
-        replace(s, name=f"{s.name[:-2]}{number:02d}", traffic=TrafficPlan(draw=number))
-        for s in natural(graph, routes, 1)
-    ]
+def fixed(scenario: Scenario, number: int) -> Scenario:
+    """Return a scenario of `natural` with draw `number` of traffic in every episode."""
+    plan = replace(TRAFFIC, draw=number)
+    return replace(scenario, name=f"{scenario.name[:-2]}{number:02d}", seed=0, traffic=plan)
+
+
+def crosses(scenario: Scenario, graph: LaneGraph) -> bool:
+    """Return whether vehicles or cyclists cross the ego's way by their schedules."""
+    assert scenario.traffic is not None
+    # walkers do not count, and the others are drawn the same without them
+    riders = replace(scenario, traffic=replace(scenario.traffic, walkers=0))
+    return scheduled_crossings(build_episode(riders, graph, seed=0)) >= CROSSING
+
+
+def crossing_draws(scenario: Scenario, graph: LaneGraph) -> Iterator[Scenario]:
+    """Yield the draws of traffic on a route in which vehicles cross the ego's way, up to draw 40."""
+    for number in range(MAX_DRAWS):
+        draw = fixed(scenario, number)
+        if crosses(draw, graph):
+            yield draw
 
 
 def with_crossing_traffic(towns: Mapping[str, int], count: int) -> list[Scenario]:
-    """The first `count` draws of traffic, one on each route after the other, in which vehicles cross the ego's way."""
+    """Return `count` draws of traffic in which vehicles cross the ego's way.
+
+    Of every route the first such draw is taken, then the second of each, and so on; town by town.
+
+    Args:
+        towns: Town -> number of junction routes.
+        count: Number of scenarios.
+
+    Raises:
+        RouteError: The routes do not have so many.
+    """
     graphs = {town: load_town(town) for town in towns}
+    routes = [s for town, number in towns.items() for s in natural(graphs[town], number)]
+    searches = [crossing_draws(scenario, graphs[scenario.town]) for scenario in routes]
     chosen: list[Scenario] = []
-    for number in itertools.count():
-        found = [s for town, routes in towns.items() for s in draws(graphs[town], routes, number)]
-        crossed = crossings([build_episode(s, graphs[s.town], seed=0) for s in found], graphs)
-        chosen += [s for s, n in zip(found, crossed.tolist(), strict=True) if n >= CROSSING]
-        if len(chosen) >= count:
-            break
-    return chosen[:count]
+    while len(chosen) < count:
+        draws = [draw for search in searches if (draw := next(search, None)) is not None]
+        if not draws:
+            raise RouteError(f"only {len(chosen)} of {count} draws in which traffic crosses the way; take more routes")
+        chosen += draws[: count - len(chosen)]
+    return chosen
 
 
-def unselected(towns: Mapping[str, int]) -> list[Scenario]:
-    """Draws of traffic on the same routes as they come: other ones than those above, and in every episode new ones."""
+def unselected(towns: Mapping[str, int], count: int) -> list[Scenario]:
+    """Return draws of traffic on the same routes as they come, other ones in every episode."""
+    rounds = itertools.count()
+    draws = (s for number in rounds for town, routes in towns.items() for s in natural(load_town(town), routes, number))
     return [
         replace(s, name=s.name.replace("natural/", "natural-unselected/"), seed=1000 + s.seed)
-        for town, routes in towns.items()
-        for s in natural(load_town(town), routes, UNSELECTED)
+        for s in itertools.islice(draws, count)
     ]
 
 
@@ -324,10 +359,10 @@ def training() -> dict[str, str]:
     And what FREA learns in: junctions of towns with parallel lanes, which those towns hardly have.
     """
     found = []
-    lanes = [s for town in LANE_TOWNS for s in natural(load_town(town), 12, repetitions=1)]
+    lanes = [s for town in LANE_TOWNS for s in natural(load_town(town), 12)]
     for town in TRAINING_TOWNS:
         graph = load_town(town)
-        drives = [replace(s, name=f"training/{s.name}") for s in natural(graph, 12, repetitions=1)]
+        drives = [replace(s, name=f"training/{s.name}") for s in natural(graph, 12)]
         found += [*precrash(graph, 6, prefix=f"training/{town}/", least=0), *drives]
     beside = [replace(s, name=f"training-lanes/{s.name}") for s in lanes]
     return {"training.yaml": scenario_text(found), "training-lanes.yaml": scenario_text(beside)}
@@ -338,7 +373,7 @@ def make() -> dict[str, str]:
     return {
         "precrash.yaml": scenario_text(precrash(load_town(PRECRASH_TOWN))),
         "natural.yaml": scenario_text(with_crossing_traffic(NATURAL_TOWNS, NATURAL)),
-        "natural-unselected.yaml": scenario_text(unselected(NATURAL_TOWNS)),
+        "natural-unselected.yaml": scenario_text(unselected(NATURAL_TOWNS, NATURAL)),
         "stop-signs.yaml": scenario_text(past_stop_signs(SIGN_TOWNS)),
     }
 

@@ -121,7 +121,8 @@ def found_files(out: Path, part: str, size: Size) -> list[str]:
 
 def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     """Search the bases that fall to one ego, and save the distinct collisions."""
-    from ssad.experiments.adversarial.search_scores import MOVING, distinct_collisions
+    from ssad.core.types import MOVING
+    from ssad.experiments.adversarial.search_scores import distinct_collisions
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 

@@ -61,7 +61,7 @@ def train_adversary() -> dict[str, float]:
     """Adv.PPO from nothing, validation and final test included: time, and what its card says."""
     began, used = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        list(run_adversary_training(AdversaryPlan("adv-ppo", Path(folder))))
+        list(run_adversary_training(AdversaryPlan("adv-ppo-paper", Path(folder))))
         card, _ = load_card(Path(folder) / "adv-ppo.safetensors")
     return {"seconds": time.perf_counter() - began, "processor_s": time.process_time() - used, **card.metrics}
 
@@ -88,7 +88,7 @@ def page(found: dict[str, Any]) -> None:
 def main() -> None:
     """Print the rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenarios", default="natural")
+    parser.add_argument("--scenarios", default="natural-uniform")
     parser.add_argument("--steps", type=int, default=64 * 128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--no-highway", action="store_true")

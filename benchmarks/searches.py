@@ -2,8 +2,9 @@
 
 `python -m benchmarks.searches --generators random,cma-es,bayesian,l2c` lets each search the pre-crash scenarios that
 the system survives as they are, with the same seeds and the same budget, and keeps what came of it in
-benchmarks/results/searches.json; `--page` writes the table of what is there. Each base scenario is a cluster: its
-searches with several seeds are one case, and differences to random search are paired by base.
+benchmarks/results/searches.json; `--page` writes the table of what is there. A search that is kept is not run again
+without `--anew`. A route with all its base scenarios is a cluster; the searches of a base with several seeds are one
+case, and differences to random search are paired by base.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from ssad.drivers import make_system
 from ssad.experiments.adversarial.found_collisions import proven_bases
+from ssad.experiments.scenario_kind import route_key
 from ssad.metrics import CaseValue, Estimate, estimate, paired_difference
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
@@ -52,12 +54,17 @@ def measure(name: str, *, system: str, set_name: str, seeds: int, budget: int) -
         first = next((k for k, outcome in enumerate(row, 1) if outcome.is_valid), None)
         found.setdefault(base.scenario.name, []).append(first)
         share.setdefault(base.scenario.name, []).append(float(np.mean([outcome.is_valid for outcome in row])))
-    return {"first": found, "share": share, "proven": proven, "any": collided}
+    routes = {base.scenario.name: route_key(base.scenario) for base in alive}
+    return {"first": found, "share": share, "proven": proven, "any": collided, "routes": routes}
 
 
-def cases(rows: dict[str, list[Any]], value: Any) -> dict[str, CaseValue]:
-    """A mean over seeds for each base."""
-    return {name: CaseValue(float(np.mean([value(v) for v in row])), name, name) for name, row in rows.items()}
+def cases(measured: dict[str, Any], column: str, value: Any = float) -> dict[str, CaseValue]:
+    """A mean over seeds for each base; its cluster is its route."""
+    routes = measured.get("routes", {})
+    return {
+        name: CaseValue(float(np.mean([value(v) for v in row])), routes.get(name, name), name)
+        for name, row in measured[column].items()
+    }
 
 
 def text(found: Estimate, *, sign: bool = False) -> str:
@@ -69,11 +76,11 @@ def text(found: Estimate, *, sign: bool = False) -> str:
 def headline_cells(measured: dict[str, Any], name: str) -> list[str]:
     """Share of the bases with a proven collision, the same less random's, and the raw CR; n/a: not measured."""
     row, random = measured[name], measured["random"]
-    proven = cases(row["proven"], float) if "proven" in row else None
+    proven = cases(row, "proven") if "proven" in row else None
     less = "" if name == "random" else "n/a"
     if proven is not None and "proven" in random and name != "random":
-        less = text(paired_difference(proven, cases(random["proven"], float)), sign=True)
-    raw = text(estimate(cases(row["any"], float).values(), "bounded")) if "any" in row else "n/a"
+        less = text(paired_difference(proven, cases(random, "proven")), sign=True)
+    raw = text(estimate(cases(row, "any").values(), "bounded")) if "any" in row else "n/a"
     return ["n/a" if proven is None else text(estimate(proven.values(), "bounded")), less, raw]
 
 
@@ -97,12 +104,12 @@ def table(data: dict[str, Any]) -> list[str]:
         headline = headline_cells(measured, name)
         for most in parts:
             own, random = (
-                cases(measured[who]["first"], lambda first, most=most: first is not None and first <= most)
+                cases(measured[who], "first", lambda first, most=most: first is not None and first <= most)
                 for who in (name, "random")
             )
             cells.append(text(estimate(own.values(), "bounded")))
             more.append("" if name == "random" else text(paired_difference(own, random), sign=True))
-        own, random = (cases(measured[who]["share"], float) for who in (name, "random"))
+        own, random = (cases(measured[who], "share") for who in (name, "random"))
         last = ["" if name == "random" else text(paired_difference(own, random), sign=True)]
         lines.append(
             f"| `{name}` | {' | '.join([*headline, *cells, *more, text(estimate(own.values(), 'bounded')), *last])} |"
@@ -120,6 +127,7 @@ def main() -> None:
     parser.add_argument("--set", default="precrash", dest="set_name")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget", type=int, default=32)
+    parser.add_argument("--anew", action="store_true", help="search again with generators that are kept")
     parser.add_argument("--page", action="store_true", help="write docs/results/generators.md")
     given = parser.parse_args()
     about = {"system": given.system, "set": given.set_name, "seeds": given.seeds, "budget": given.budget}
@@ -127,6 +135,8 @@ def main() -> None:
     if {key: data.get(key) for key in about} != about:
         data = about | {"generators": {}}
     for name in filter(None, given.generators.split(",")):
+        if name in data["generators"] and "proven" in data["generators"][name] and not given.anew:
+            continue
         data["generators"][name] = measure(
             name, system=given.system, set_name=given.set_name, seeds=given.seeds, budget=given.budget
         )

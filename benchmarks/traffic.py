@@ -7,7 +7,8 @@ of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs
 files hold (`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
 
 `--human` measures how much the traffic is like that of people: headways, gaps, speeds, braking, junctions, signals,
-lane changes, beside published figures. With `--page` it writes their tables and picture.
+lane changes, beside published figures. With `--page` it writes their tables and picture. With `--walkers` and
+`--cyclists` it measures them too: crossings, waits, vehicles that yield, times between walkers and vehicles.
 """
 
 from __future__ import annotations
@@ -38,9 +39,17 @@ from ssad.core.types import (
     Route,
     Scenario,
     SignalState,
+    TrafficPlan,
 )
 from ssad.scenarios.dynamic.knowledge.driver_population import with_driver
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
+from ssad.scenarios.dynamic.knowledge.vulnerable_users import (
+    EDGE,
+    MAX_SPEED_LIMIT,
+    cycling_route,
+    cyclist,
+    draw_walkers,
+)
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
 from ssad.world.roads import load_town, random_route
@@ -93,9 +102,22 @@ def town_routes(graph: LaneGraph, count: int, length: float) -> list[Route]:
 
 
 def traffic(
-    graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: int, green: bool, drivers: str = "uniform"
+    graph: LaneGraph,
+    routes: Sequence[Route],
+    vehicles: int,
+    *,
+    key: int,
+    green: bool,
+    drivers: str = "uniform",
+    walkers: int = 0,
+    cyclists: int = 0,
+    seconds: float = 300.0,
+    errors: float = 0.0,
 ) -> Episode:
-    """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads."""
+    """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads.
+
+    Walkers walk for `seconds`. Drivers of the population make so many errors an hour each.
+    """
     draws = generator("traffic", graph.name, key)
     agents: list[EpisodeAgent] = []
     for number in draws.permutation(len(routes)).tolist():
@@ -113,13 +135,41 @@ def traffic(
         agent = EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route)
         if drivers == "population":
             # how fast it likes to go is its driver's pace
-            agent = with_driver(replace(agent, target_speed=float(route.speed_limit.max())), key, len(agents))
+            agent = replace(agent, target_speed=float(route.speed_limit.max()))
+            agent = with_driver(agent, key, len(agents), errors=errors)
         agents.append(agent)
+    if cyclists:
+        agents += town_cyclists(graph, routes, agents, cyclists, key)
+    plan = TrafficPlan(walkers=walkers)
+    agents += draw_walkers(plan, graph, None, agents, seconds, "traffic", graph.name, key)
     limits = EpisodeLimits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
     scenario = Scenario(f"traffic/{key}", "Custom", graph.name, (agents[0].pose, agents[0].pose), limits=limits)
     real = np.flatnonzero(~graph.signal_virtual).tolist()
     forced = dict.fromkeys(real, SignalState.GREEN) if green else {}
     return Episode(f"traffic/{graph.name}/{key}", scenario, graph.name, tuple(agents), forced, 1e6, limits)
+
+
+def town_cyclists(
+    graph: LaneGraph, routes: Sequence[Route], others: Sequence[EpisodeAgent], count: int, key: int
+) -> list[EpisodeAgent]:
+    """Draw cyclists on those of the ways that begin on an outermost lane."""
+    draws = generator("traffic cyclists", graph.name, key)
+    beside = graph.left if graph.left_hand[0] else graph.right
+    agents: list[EpisodeAgent] = []
+    for number in draws.permutation(len(routes)).tolist():
+        if len(agents) == count:
+            break
+        route = routes[number]
+        neighbour = int(beside[route.lane[0]])
+        is_fast = float(route.speed_limit[0]) > MAX_SPEED_LIMIT
+        if is_fast or (neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING):
+            continue
+        path = cycling_route(graph, route, float(draws.uniform(*EDGE)))
+        start = tuple(path.xy[0].tolist())
+        if any(math.dist((agent.pose.x, agent.pose.y), start) < APART for agent in (*others, *agents)):
+            continue
+        agents.append(cyclist(f"cyclist {len(agents) + 1}", path, 0.0, draws))
+    return agents
 
 
 def patience(graph: LaneGraph) -> float:
@@ -228,6 +278,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
     parser.add_argument("--scenes", type=int, default=128, help="at most so many side by side")
     parser.add_argument("--drivers", choices=("uniform", "population"), default="uniform")
+    parser.add_argument("--walkers", type=int, default=0, help="walkers in each scene, with --human")
+    parser.add_argument("--cyclists", type=int, default=0, help="cyclists in each scene, with --human")
     parser.add_argument("--signals", choices=("program", "green"), default="program")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
@@ -274,6 +326,8 @@ def compare_with_people(given: argparse.Namespace) -> None:
     from benchmarks.traffic_human import drive_town, load, show, write_page
 
     about = {"world": VERSION, "drivers": given.drivers, "vehicles": given.vehicles, "minutes": given.minutes}
+    if given.walkers or given.cyclists:
+        about |= {"walkers": given.walkers, "cyclists": given.cyclists}
     towns = load(given.json)["towns"] if given.json and given.json.is_file() else []
     measured = {town["town"] for town in towns}
     scenes = max(1, math.ceil(given.hours * 60.0 / (given.vehicles * given.minutes)))
@@ -284,7 +338,10 @@ def compare_with_people(given: argparse.Namespace) -> None:
         routes = town_routes(graph, ROUTES, LENGTH)
         keys = range(given.first, given.first + scenes)
         green = given.signals == "green"
-        episodes = [traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers) for k in keys]
+        people = {"walkers": given.walkers, "cyclists": given.cyclists, "seconds": 60.0 * given.minutes}
+        episodes = [
+            traffic(graph, routes, given.vehicles, key=k, green=green, drivers=given.drivers, **people) for k in keys
+        ]
         size = min(given.scenes, RECORDED)
         batches = [episodes[first : first + size] for first in range(0, scenes, size)]
         towns.append(drive_town(graph, batches, seconds=60.0 * given.minutes, device=given.device))

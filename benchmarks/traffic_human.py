@@ -7,7 +7,7 @@ The published values come from `ssad.metrics.human_driving`, each with its certa
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,19 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import traffic_walkers
 from benchmarks.insert import DOCS, insert
+from benchmarks.traffic_walkers import (
+    BESIDE_PUBLISHED,
+    WalkRecord,
+    WalkRecorder,
+    count_contacts,
+    is_vehicle,
+    measure_walkers,
+    walker_rates,
+)
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import End, Episode
+from ssad.core.types import AgentKind, End, Episode
 from ssad.metrics.human_driving import certainty_of, published, spread
 from ssad.metrics.traffic_statistics import (
     begins,
@@ -61,7 +71,7 @@ BESIDE = {
     "post-encroachment time": "post-encroachment time",
     "lane changes": "lane changes",
     "contacts": "contacts",
-}
+} | BESIDE_PUBLISHED
 
 
 @dataclass
@@ -83,12 +93,16 @@ class Record:
     phase: Any
     scene: Any
     length: Any
-    contacts: int
+    contacts: Mapping[str, int]
     dt: float
+    walks: WalkRecord | None = None
 
 
 def record(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, device: str = "cpu") -> Record:
-    """Drive the scenes side by side and keep the vehicles that the world drives, step by step."""
+    """Drive the scenes side by side and keep the vehicles that the world drives, step by step.
+
+    Walkers and cyclists are kept for themselves: no statistic of vehicles counts them.
+    """
     world = World(episodes, {graph.name: graph}, device=device)
     tables, route = world.bank.tables, world.bank.route[world.assigned]
     limits = np.append(graph.speed_limit, np.nan).astype(np.float32)
@@ -96,7 +110,11 @@ def record(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, dev
     programs = signal_programs(graph)
     scenes = np.repeat(np.arange(world.batch), world.agents).reshape(world.batch, world.agents)
     columns: dict[str, list[Any]] = defaultdict(list)
-    contacts, before = 0, np.zeros((world.batch, world.agents), np.int64)
+    kind = world.bank.kind[world.assigned]
+    vehicles = is_vehicle(kind)
+    walks = None if vehicles[kind != AgentKind.NONE].all() else WalkRecorder(world)
+    contacts: Counter[str] = Counter()
+    before = np.zeros((world.batch, world.agents), np.int64)
     if device != "cpu":
         world.step()  # compiles
         world.reset()
@@ -107,7 +125,9 @@ def record(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, dev
         fresh, before = touch & ~before, touch
         if step * world.dt <= SETTLE:
             continue
-        contacts += sum(int(row).bit_count() for row in fresh.ravel().tolist()) // 2
+        contacts.update(count_contacts(fresh, kind))
+        if walks is not None:
+            walks.add()
         point = route[..., 0] + world.array("progress")
         pose, speed = world.array("pose").copy(), world.array("speed").copy()
         at = tables.path[point]
@@ -122,7 +142,7 @@ def record(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, dev
             "pose": pose,
             "speed": speed,
             "acceleration": world.array("accel").copy(),
-            "present": (world.array("active") != Presence.ABSENT) & (world.ended() == End.RUNNING)[:, None],
+            "present": (world.array("active") != Presence.ABSENT) & (world.ended() == End.RUNNING)[:, None] & vehicles,
             "lane": lane,
             "limit": limits[lane],
             "cap": rule[..., 0],
@@ -140,7 +160,14 @@ def record(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, dev
         for name, value in now.items():
             columns[name].append(value.reshape(world.batch * world.agents, *value.shape[2:]))
     stacked = {name: np.stack(values) for name, values in columns.items()}
-    return Record(**stacked, scene=scenes.ravel(), length=2.0 * half.ravel(), contacts=contacts, dt=world.dt)
+    return Record(
+        **stacked,
+        scene=scenes.ravel(),
+        length=2.0 * half.ravel(),
+        contacts=contacts,
+        dt=world.dt,
+        walks=None if walks is None else walks.record(),
+    )
 
 
 def crossings(drive: Record) -> tuple[Any, Any, Any]:
@@ -199,8 +226,10 @@ def measure(drive: Record, graph: LaneGraph) -> dict[str, Any]:
     free &= (drive.gap > 60.0) | (drive.gap > 5.0 * speed)
     starting = present & (acceleration > 0.2) & (speed > 0.5) & (speed < 4.0)
     braking = present & (acceleration < -0.5)
+    walkers = {"samples": {}, "counts": {}} if drive.walks is None else measure_walkers(drive.walks, graph)
     return {
-        "samples": {
+        "samples": walkers["samples"]
+        | {
             "speed": speed[present][::20],
             "speed over limit": (speed[free] / drive.limit[free])[::20],
             "time gap": time_gaps(drive.gap, speed, present)[::10],
@@ -213,10 +242,11 @@ def measure(drive: Record, graph: LaneGraph) -> dict[str, Any]:
             "rejected gap": rejected,
             "post-encroachment time": post_encroachment_times(stays, dt),
         },
-        "counts": {
+        "counts": walkers["counts"]
+        | dict(drive.contacts)
+        | {
             "metres": distance(speed, present, dt),
             "hours": float(present.sum()) * dt / 3600.0,
-            "contacts": drive.contacts,
             "lane changes": lane_changes(drive.lane.astype(np.int64), *beside, present),
             **{f"onsets {limit:g}": braking_onsets(acceleration, present, limit) for limit in THRESHOLDS},
         },
@@ -261,7 +291,8 @@ def summary(town: str, samples: Mapping[str, Any], counts: Mapping[str, float], 
             "lane changes": counts["lane changes"] / (counts["metres"] / 1e3),
             "critical gap": critical_gap(samples["accepted gap"], samples["rejected gap"]),
             "start-up lost time": lost,
-        },
+        }
+        | (walker_rates(dict(counts)) if counts["walker hours"] + counts["cyclist hours"] > 0.0 else {}),
         "distributions": {name: quantiles(values) for name, values in samples.items()},
         "quantiles": {
             name: np.round(np.quantile(values, np.linspace(0.0, 1.0, 101)), 3).tolist()
@@ -323,6 +354,27 @@ def rows_of(towns: Sequence[Mapping[str, Any]]) -> list[str]:
             " / ".join(f"{town['distributions'][name][key]:.2f}" for key in keys) if town["distributions"][name] else ""
             for town in towns
         ]
+        lines.append("| " + " | ".join([title, *cells, published_range(name)]) + " |")
+    return lines + walker_rows([town for town in towns if "crossings" in town["rates"]])
+
+
+def walker_rows(towns: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the tables of walkers and cyclists; nothing without them."""
+    if not towns:
+        return []
+    heads = ["town", *(title for _, title in traffic_walkers.RATES)]
+    lines = ["", "Walkers and cyclists:", "", "| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for town in towns:
+        values = [town["rates"][name] for name, _ in traffic_walkers.RATES]
+        cells = [f"{value:.2f}" if value is not None and np.isfinite(value) else "" for value in values]
+        lines.append("| " + " | ".join([town["town"], *cells]) + " |")
+    published_cells = [published_range(name) for name, _ in traffic_walkers.RATES]
+    lines.append("| *published* | " + " | ".join(published_cells) + " |")
+    heads = ["", *(town["town"] for town in towns), "published"]
+    lines += ["", "Percentiles 5, 50 and 95:", "", "| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for name, title in traffic_walkers.DISTRIBUTIONS:
+        parts = [town["distributions"].get(name) for town in towns]
+        cells = [" / ".join(f"{part[key]:.2f}" for key in ("p5", "p50", "p95")) if part else "" for part in parts]
         lines.append("| " + " | ".join([title, *cells, published_range(name)]) + " |")
     return lines
 

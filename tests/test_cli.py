@@ -13,6 +13,7 @@ import pytest
 from helpers.command import ssad, ssad_process
 from helpers.plugin import install
 
+from ssad.cli import main
 from ssad.core.version import __version__
 
 COMMANDS = ("run", "plan", "report", "compare", "replay", "shift", "score", "record", "list", "import", "doctor")
@@ -79,6 +80,22 @@ def test_bad_input_is_one_line_and_writes_nothing(
     fails(ssad(*arguments), *parts)
     assert os.listdir(work) == []
     assert not home.exists()
+
+
+def test_a_terminal_shows_an_error_in_lines_of_its_width(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same words as in a pipe, where they are one line."""
+    message = ssad("run", "quick", "--set", "sistems=x").stderr
+    assert len(message) > 80
+    monkeypatch.setattr(sys, "argv", ["ssad", "run", "quick", "--set", "sistems=x"])
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with pytest.raises(SystemExit):
+        main()
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 1
+    assert max(map(len, lines)) <= 80
+    assert " ".join(line.strip() for line in lines) == message.strip()
 
 
 def test_a_process_ends_with_the_same_line_and_code(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_detect_draws_boxes_and_lists_them(mine: Path) -> None:
     street = np.full((120, 200, 3), 90, np.uint8)
     save_picture(Path("street.png"), street)
     done = ssad("detect", "street.png", "out", "--detector", f"{mine.name}:Finder?side=40", "--device", "cpu")
-    assert done.stdout == "out/street.jpg: 1 boxes\nboxes: out/detections.json\n"
+    assert done.stdout == "out/street.jpg: 1 box\nboxes: out/detections.json\n"
     assert json.loads(Path("out/detections.json").read_text()) == {
         "street.png": [{"box": [10.0, 10.0, 50.0, 50.0], "class": "car", "score": 0.5}]
     }
@@ -150,8 +150,8 @@ def photographs(tmp_path: Path) -> Path:
 def test_detect_takes_a_folder_of_photographs_upright_and_whole(mine: Path, photographs: Path) -> None:
     done = ssad("detect", photographs, "out", "--detector", f"{mine.name}:Finder?side=40", "--device", "cpu")
     assert done.returncode == 1
-    assert "out/turned.jpg: 1 boxes; turned upright (EXIF orientation 6)\n" in done.stdout
-    assert "out/grey.jpg: 1 boxes; greyscale repeated to three channels\n" in done.stdout
+    assert "out/turned.jpg: 1 box; turned upright (EXIF orientation 6)\n" in done.stdout
+    assert "out/grey.jpg: 1 box; greyscale repeated to three channels\n" in done.stdout
     assert "not read: broken.png: not a JPEG, PNG" in done.stdout
     assert "not read: outside.png: a symbolic link that leads out of" in done.stdout
     rows = json.loads(Path("out/detections.json").read_text())
@@ -208,7 +208,7 @@ def test_real_photographs_pass_through_every_command_upright_and_whole(mine: Pat
     originals = {path.stem: read_image(path) for path in sorted(source.iterdir()) if path.suffix in (".jpg", ".png")}
     assert len(originals) == 8
     detected = ssad("detect", source, "found", "--detector", f"{mine.name}:Finder", "--device", "cpu")
-    assert detected.stdout.count(": 1 boxes\n") == 8
+    assert detected.stdout.count(": 1 box\n") == 8
     shifted = ssad("shift", source, "shifted", "--shifts", "overexposure", "--severity", "1", "--workers", "1")
     assert "8 pictures shifted, 3 other files linked unchanged" in shifted.stdout
     assert "(8 of 8 pictures" in ssad("show", source, "page").stdout

@@ -21,8 +21,8 @@ SMALL_HASH = "cca9d38a0c85684b7807bc25da3ced9dd663ef93e79f3a1f4a76fe7a1d871678"
 def make_trace(seed: int = 0, steps: int = T) -> EpisodeTrace:
     rng = np.random.default_rng(seed)
     shapes = {"kind": (A,), "length": (A,), "width": (A,), "signal_ids": (S,), "signal": (steps, S), "route": (9, 2)}
-    shapes |= dict.fromkeys(("x", "y", "yaw", "speed", "active"), (steps, A))
-    kinds = {"F32": np.float32, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
+    shapes |= dict.fromkeys(("x", "y", "yaw", "speed", "active", "turn_signal"), (steps, A))
+    kinds = {"F32": np.float32, "I8": np.int8, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
     values = {
         f.name: (rng.random(shapes.get(f.name, (steps,))) * 3).astype(kinds[str(f.type)])
         for f in fields(EpisodeTrace)
@@ -54,6 +54,14 @@ def test_stated_heights_are_stored_and_checked(tmp_path: Path) -> None:
     save_trace(tmp_path / "t.npz", replace(trace, heights=(1.5,)))
     with pytest.raises(FormatError, match="heights of 3 agents"):
         load_trace(tmp_path / "t.npz")
+
+
+def test_a_trace_without_turn_signals_is_that_of_earlier_versions(tmp_path: Path) -> None:
+    trace = replace(make_trace(), turn_signal=np.zeros((0, 0), np.int8))
+    save_trace(tmp_path / "t.npz", trace)
+    assert "turn_signal" not in safeio.load_npz(tmp_path / "t.npz")
+    assert load_trace(tmp_path / "t.npz").turn_signal.shape == (0, 0)
+    assert str(first_difference(trace, make_trace())) == "step 0: turn_signal: shape (0, 0) against (5, 3)"
 
 
 def test_without_signals(tmp_path: Path) -> None:
@@ -109,6 +117,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         ({"speed": None}, "not a whole episode trace (speed)"),
         ({"yaw": np.zeros((A, T), np.float32)}, "yaw has shape (3, 5)"),
         ({"active": np.zeros((T, A + 1), bool)}, "active has shape (5, 4)"),
+        ({"turn_signal": np.zeros((T, 1), np.int8)}, "turn_signal has shape (5, 1)"),
         ({"meta": np.frombuffer(b'{"format":1}', np.uint8)}, "dt, end, key, models, names, town"),
         ({"meta": np.frombuffer(b'{"format":2}', np.uint8)}, "of another format"),
         ({"meta": np.frombuffer(b"[1]", np.uint8)}, "of another format"),

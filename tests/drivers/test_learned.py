@@ -47,7 +47,7 @@ def test_shipped_weights_drive(name: str) -> None:
     traces = rollout(world_of(*FEW), make_system(name))
     found = [episode_metrics(trace) for trace in traces]
     assert np.mean([row.route_completion for row in found]) > 0.7
-    assert np.median([row.driven / row.time for row in found]) > 3.0  # nobody stands still
+    assert np.median([row.driven / row.time for row in found]) > 2.0  # nobody stands still
     # td3 leaves the road where that is shorter (docs/results/drivers.md)
     assert np.mean([row.off_road_fraction for row in found]) < (0.6 if name == "td3" else 0.1)
 

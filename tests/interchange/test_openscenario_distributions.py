@@ -12,6 +12,7 @@ from helpers.openscenario import document, lane_position, start, write
 from ssad.core.errors import FormatError
 from ssad.interchange.openscenario_distributions import assigned_values, parameter_sets
 from ssad.interchange.openscenario_document import read_document
+from ssad.interchange.openscenario_reader import read_openscenario_set
 from ssad.scenarios.dynamic import read_scenarios
 
 SINGLE = '<DeterministicSingleParameterDistribution parameterName="{}">{}</DeterministicSingleParameterDistribution>'
@@ -105,6 +106,32 @@ def test_broken_distributions_are_refused(content: str, message: str, tmp_path: 
     assert message in str(refused.value)
     with pytest.raises(FormatError, match="NAME=VALUE"):
         assigned_values(["speed"])
+
+
+def test_a_parameter_that_the_scenario_does_not_declare_is_named_with_its_line(tmp_path: Path) -> None:
+    """With the file and the line of the distribution, not of the scenario."""
+    declared = '<ParameterDeclaration name="gap" parameterType="double" value="5"/>'
+    starts = start("Ego", lane_position(-1, 50), "$gap") + start("Target", lane_position(-1, 100), 5)
+    write(tmp_path, document(starts, parameters=declared))
+    content = SINGLE.format("gap", RANGE.format(5, 5, 10)) + "\n" + SINGLE.format("gop", RANGE.format(5, 5, 10))
+    path = tmp_path / "d.xosc"
+    path.write_text(distribution(f"<Deterministic>\n{content}</Deterministic>"))
+    with pytest.raises(FormatError) as refused:
+        read_openscenario_set(path)
+    assert str(refused.value) == (
+        f"{path}:3: DeterministicSingleParameterDistribution: its scenario declares no parameter 'gop' that could be "
+        "set; declared: gap"
+    )
+
+
+@pytest.mark.parametrize(("minor", "is_noted"), [("2", False), ("3", False), ("4", True)])
+def test_a_version_newer_than_known_is_noted(minor: str, is_noted: bool, tmp_path: Path) -> None:
+    starts = start("Ego", lane_position(-1, 50), 10) + start("Target", lane_position(-1, 100), 5)
+    text = document(starts).replace('revMinor="3"', f'revMinor="{minor}"')
+    report = read_openscenario_set(write(tmp_path, text)).report
+    notes = [note for note in report.notes if "newer than 1.3" in note]
+    assert len(notes) == is_noted
+    assert all(f"version 1.{minor}" in note for note in notes)
 
 
 def test_a_distribution_becomes_a_set_of_scenarios(tmp_path: Path) -> None:

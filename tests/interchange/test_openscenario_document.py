@@ -42,9 +42,13 @@ def test_parameters_and_expressions_are_put_in(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("declarations", "part", "message"),
     [
-        (declared("a", "1"), '<Part x="$b"/>', "a.xosc:6: Part: x: parameter $b is not declared"),
+        (declared("a", "1"), '<Part x="$b"/>', "a.xosc:6: Part: x: parameter $b is not declared; closest: $a"),
         (declared("a", "0"), '<Part x="${1 / $a}"/>', "a.xosc:6: Part: x: expression '1 / $a': division by zero"),
-        (declared("a", "1"), '<Part x="${$a + $c}"/>', "a.xosc:6: Part: x: expression '$a + $c': there is no"),
+        (
+            declared("gap", "1"),
+            '<Part x="${$gap + $gop}"/>',
+            "a.xosc:6: Part: x: expression '$gap + $gop': parameter $gop is not declared; closest: $gap",
+        ),
         (declared("a", "${$b}") + declared("b", "$a"), "<Part/>", "a.xosc:4: ParameterDeclaration: the parameter"),
         (declared("a", "1"), '<Part x="$a$a"/>', "a.xosc:6: Part: x: '$a$a' is neither $parameter nor"),
     ],

@@ -286,7 +286,8 @@ def test_values_that_the_standard_excludes_are_refused(
             0,
             speed_action(0, "linear", "rate", 0),
             by_time(3),
-            "the speed of 'Target' stays as it is: its rate is 0",
+            "a SpeedAction of 'Target' has the rate 0, with which its target is never reached: the speed stays as it "
+            "is, and the action has no end",
         ),
         (
             15,

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
-from ssad.metrics.realism import FEATURES, histogram, motion_features, pool_motions, realism, wasserstein
+from ssad.core.errors import FormatError
+from ssad.core.safeio import dump_json
+from ssad.metrics.human_driving import published
+from ssad.metrics.realism import (
+    FEATURES,
+    REFERENCE,
+    histogram,
+    motion_features,
+    pool_motions,
+    published_limits,
+    realism,
+    reference_data,
+    traffic_reference,
+    wasserstein,
+    within_published,
+)
+from ssad.world.world import VERSION
 
 STEP = 0.1 * np.arange(21)
 INSIDE = np.full(21, -3.0)
@@ -85,3 +103,65 @@ def test_the_histograms_are_the_challenges() -> None:
         "off_road": (0.0, 1.0, 2),
     }
     assert {name: (feature.low, feature.high, feature.bins) for name, feature in FEATURES.items()} == challenge
+
+
+def within(speed: np.ndarray, yaw_rate: float = 0.0) -> np.ndarray:
+    """Steps within the published limits of a motion with a speed for each step of 0.1 s."""
+    place = np.cumsum(speed) * 0.1
+    agent = (place, 0.0, yaw_rate * 0.1 * np.arange(len(speed)), speed)
+    return within_published(make_trace(len(speed), [(-100.0, 0, 0, 0), agent]), 1)
+
+
+def test_the_published_limits_are_those_of_the_sources() -> None:
+    limits = published_limits()
+    assert limits.acceleration in [v.mean for v in published("acceleration from rest")]
+    assert limits.deceleration in [v.high for v in published("largest deceleration of a routine stop")]
+    assert limits.lateral in [v.high for v in published("lateral acceleration in turns")]
+    assert limits.jerk in [v.high for v in published("jerk")]
+
+
+def test_steps_count_as_ordinary_up_to_the_published_limits() -> None:
+    limits, time = published_limits(), 0.1 * np.arange(21)
+    assert len(within(5.0 + time)) == 20
+    for value, ordinary in ((0.95 * limits.acceleration, True), (1.05 * limits.acceleration, False)):
+        assert within(2.0 + value * time).all() == ordinary
+    for value, ordinary in ((0.95 * limits.deceleration, True), (1.05 * limits.deceleration, False)):
+        assert within(10.0 - value * time).all() == ordinary
+    for value, ordinary in ((0.95 * limits.lateral, True), (1.05 * limits.lateral, False)):
+        assert within(np.full(21, 8.0), value / 8.0).all() == ordinary
+    # from one acceleration to another at 1 s: over windows of 0.5 s a jerk of twice their difference
+    for step, ordinary in ((0.48 * limits.jerk, True), (0.52 * limits.jerk, False)):
+        rise = 0.45 * step * np.minimum(time, 1.0) - 0.55 * step * np.maximum(time - 1.0, 0.0)
+        assert within(8.0 + rise).all() == ordinary
+
+
+def test_a_reference_keeps_distributions_and_counts(tmp_path: Path) -> None:
+    draws = np.random.default_rng(0)
+    motions = [
+        {name: draws.normal(5.0, 2.0, 60) if f.bins > 2 else np.array([float(k < 2)]) for name, f in FEATURES.items()}
+        for k in range(40)
+    ]
+    path = tmp_path / "reference.json"
+    path.write_text(dump_json(reference_data(motions, world=1)))
+    kept, pooled = traffic_reference(path), pool_motions(motions)
+    assert json.loads(path.read_text())["about"] == {"world": 1, "motions": 40}
+    assert (len(kept["collision"]), kept["collision"].sum()) == (40, 2.0)
+    assert all(distance < 0.02 for distance in wasserstein(kept, pooled).values())
+    assert realism(motions[5], kept) == pytest.approx(realism(motions[5], pooled), rel=0.01)
+    path.write_text("{}")
+    with pytest.raises(FormatError, match=r"reference.json: no reference of traffic; make it with python -m"):
+        traffic_reference(path)
+
+
+def test_the_shipped_reference_is_of_this_world_and_tells_ordinary_motions_from_others() -> None:
+    about = json.loads(REFERENCE.read_text())["about"]
+    assert about["world"] == VERSION, "run python -m benchmarks.traffic_reference"
+    assert about["motions"] > 500
+    reference = traffic_reference()
+    assert 4.0 < np.quantile(reference["speed"], 0.8) < 12.0  # many wait for the ego to come near
+    assert np.quantile(np.abs(reference["acceleration"]), 0.99) < 4.0
+    fast, swerving = ({**reference, name: values} for name, values in UNLIKELY.items())
+    assert max(realism(fast, reference), realism(swerving, reference)) < realism(reference, reference) - 0.01
+
+
+UNLIKELY = {"speed": np.full(50, 22.0), "yaw_rate": np.full(50, 0.6)}

@@ -25,7 +25,17 @@ from matplotlib.path import Path as Path2D
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.types import Actor, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalState
+from ssad.core.types import (
+    Actor,
+    AgentKind,
+    Controller,
+    Episode,
+    EpisodeLimits,
+    EpisodeTrace,
+    Pose,
+    Scenario,
+    SignalState,
+)
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard.sensors import camera_of, lidar_of, radar_of
 from ssad.metrics import episode_metrics
@@ -80,8 +90,11 @@ def same(episodes: Sequence[Episode], system: str) -> None:
         assert one.end == other.end, one.key
         assert abs(len(one.accel) - len(other.accel)) <= 1, one.key
         rows = min(len(one.accel), len(other.accel))
-        off = np.hypot(one.x[:rows] - other.x[:rows], one.y[:rows] - other.y[:rows])[one.active[:rows]]
-        assert off.max() < 0.05, one.key
+        off = np.hypot(one.x[:rows] - other.x[:rows], one.y[:rows] - other.y[:rows]) * one.active[:rows]
+        walks = one.kind == AgentKind.WALKER
+        assert off[:, ~walks].max() < 0.05, one.key
+        # a walker of the embedded world changes its speed within a step, one of CARLA from the next on
+        assert off[:, walks].max(initial=0.0) < 0.3, one.key
         measured, again = (episode_metrics(trace).as_dict() for trace in (one, other))
         for name in ("collision", "route_distance", "route_complete", "red_lights", "off_road_distance"):
             if name in measured:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from ssad.core.checkpoints import WeightsCard
-from ssad.core.types import Controller
+from ssad.core.types import Controller, EpisodeAgent, Pose
 from ssad.drivers import make_system
 from ssad.training.driver import draw_episodes, find_scenarios
+from ssad.training.feasibility import FeasibleRegion, body_distance
 from ssad.world.policy import PolicyDriver, policy_of, tensors_of
 from ssad.world.rollout import Loop
 from ssad.world.selection import FreaSelection
+from ssad.world.sensors import SENSORS
 from ssad.world.world import World
+from tests.world.worlds import GRAPHS, ego, episode
 
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
-from ssad.training.adversary_env import AdversaryEnv
+from ssad.training.adversary_env import AdversaryEnv, Conduct
 
 
 def scenes():
@@ -93,7 +98,7 @@ def test_leaving_the_road_costs(monkeypatch) -> None:
     assert found[0.5] < found[0.0] - 2.0
 
 
-@pytest.mark.parametrize("reward", ["colliding", "feasible"])
+@pytest.mark.parametrize("reward", ["colliding", "feasible", "lawful", "proving"])
 def test_other_rewards_are_paid(monkeypatch, reward: str) -> None:
     env = environment(monkeypatch, reward=reward)
     env.reset()
@@ -103,3 +108,58 @@ def test_other_rewards_are_paid(monkeypatch, reward: str) -> None:
         paid.append(env.step_wait()[1])
     assert np.isfinite(paid).all()
     assert np.abs(paid).max() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("places", "kept"),
+    [
+        ([(50.0, 0.0, 0.0)] * 5, True),
+        ([(50.0, 3.5, 0.0)] * 2 + [(50.0, 0.0, 0.0)], True),  # 0.2 s on the wrong side are forgiven
+        ([(50.0, 3.5, 0.0)] * 3 + [(50.0, 0.0, 0.0)], False),
+        ([(50.0, 0.0, 0.0), (50.0, 3.5, 0.0)], False),  # on the wrong side now
+        ([(50.0, 0.0, 0.0), (50.0, -9.0, 0.0), (50.0, 0.0, 0.0)], False),  # has left the road
+        ([(50.0, -9.0, 0.0), (50.0, 0.0, 0.0)], True),  # has come from beside it
+        ([(50.0, 0.0, 0.0), (50.0, 0.0, 0.2), (50.0, 0.0, 0.2)], False),  # 5 m/s and 2 rad/s are 10 m/s^2
+        ([(50.0, 0.0, 0.0), (60.0, 0.0, 0.0), (50.0, 0.0, 0.0)], False),  # has touched another car
+    ],
+    ids=["lawful", "briefly wrong", "wrong way", "wrong now", "left the road", "joins", "turns too hard", "touched"],
+)
+def test_conduct_is_that_of_a_proven_collision(places: list[tuple[float, float, float]], kept: bool) -> None:
+    def car(x: float, y: float, yaw: float) -> EpisodeAgent:
+        return EpisodeAgent("car", "car", Controller.NONE, Pose(x, y, yaw), speed=5.0)
+
+    conduct = Conduct(1, dt=0.1)
+    conduct.begin([0])
+    heading = 0.0
+    for x, y, yaw in places:
+        world = World([episode(ego(x=200.0), car(x, y, yaw), car(60.0, 0.0, 0.0))], GRAPHS)
+        world.step()
+        state = replace(world.state(), pose=world.state().pose.copy())
+        state.pose[0, 1] = x, y, yaw
+        alignment = SENSORS["road"](world, np.array([[0, 1]], np.int32))[:, 0]
+        found = conduct.record(state, np.array([[0, 1]], np.int32), alignment, np.array([heading], np.float32))
+        heading = yaw
+    assert found.tolist() == [kept]
+
+
+def test_the_region_is_asked_about_the_ego_before_and_after_each_step(monkeypatch) -> None:
+    class Gap(FeasibleRegion):
+        def value(self, states):
+            return body_distance(states).astype(np.float32)
+
+    env = environment(monkeypatch, region=Gap())
+    env.reset()
+    last = None
+    followed = 0
+    for _ in range(60):
+        before = env._adversaries.copy()
+        env.step_async(np.zeros((6, 2), np.float32))
+        env.step_wait()
+        np.testing.assert_array_equal(env.is_driven, before >= 0)
+        assert not env.region_values[:, ~env.is_driven].any()
+        if last is not None:
+            same = env.is_driven & last[1] & (before == last[2])
+            np.testing.assert_array_equal(env.region_values[0, same], last[0][1, same])
+            followed += int((same & np.isfinite(env.region_values[0]) & (env.region_values[0] > 0.0)).sum())
+        last = env.region_values.copy(), env.is_driven.copy(), before
+    assert followed > 10

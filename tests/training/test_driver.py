@@ -166,8 +166,12 @@ def test_an_adversary_is_trained_against_an_ego(tmp_path: Path) -> None:
     )
     assert "adv-ppo.safetensors: best at step" in line
     card, _ = load_card(tmp_path / "adv-ppo.safetensors")
-    assert (card.config["ego"], card.config["observation"], card.config["action"]) == ("autopilot", *["adversary"] * 2)
-    assert set(card.metrics) == {"00_CR", "00_valid", "00_off", "00_others"}
+    assert (card.config["ego"], card.config["observation"], card.config["action"]) == (
+        "autopilot",
+        "adversary-on-road",
+        "pedals",
+    )
+    assert set(card.metrics) == {"00_proven", "00_CR", "00_valid", "00_off", "00_others"}
 
 
 def test_an_adversary_needs_traffic(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from ssad.cli.listing import ALIASES, LISTS
 from ssad.cli.train import train_app
 from ssad.core.errors import SSADError, missing_extra, unknown_name
 from ssad.core.version import __version__
+from ssad.core.wording import terminal_columns, wrapped_line
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -121,10 +122,16 @@ def give_up_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def print_message(line: str) -> None:
+    """Print a line to standard error: broken at words where a terminal shows it, whole in a file or a pipe."""
+    columns = terminal_columns(sys.stderr)
+    print(line if columns is None else wrapped_line(line, columns), file=sys.stderr)
+
+
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     """Print a warning to the user as one line; those for developers keep their category."""
     kind = "" if issubclass(category, FutureWarning | UserWarning) else f"{category.__name__}: "
-    print(f"warning: {kind}{message}", file=sys.stderr)
+    print_message(f"warning: {kind}{message}")
 
 
 def main() -> None:
@@ -146,16 +153,16 @@ def main() -> None:
     except OSError as error:
         subject = f"{error.filename}: " if error.filename else "standard output: " if error.errno == ENOSPC else ""
         give_up_output()
-        print(f"error: {subject}{error.strerror or error}", file=sys.stderr)
+        print_message(f"error: {subject}{error.strerror or error}")
         sys.exit(2)
     except SSADError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print_message(f"error: {error}")
         sys.exit(2)
     except ModuleNotFoundError as error:  # packages of extras are imported where they are needed
         missing = missing_extra(error, "this command")
         if missing is None:
             raise
-        print(f"error: {missing}", file=sys.stderr)
+        print_message(f"error: {missing}")
         sys.exit(2)
     except typer.Abort:
         sys.exit(130)
@@ -167,6 +174,6 @@ def main() -> None:
         message = " ".join(
             error.format_message().replace("Value error, ", "").split()
         )  # pydantic's, and choices in lines
-        print(f"error: {message} (see: {command} --help)", file=sys.stderr)
+        print_message(f"error: {message} (see: {command} --help)")
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

@@ -10,6 +10,7 @@ import typer
 from ssad.cli import paths
 from ssad.cli.options import Ray, Workers
 from ssad.core.errors import ConfigError
+from ssad.core.wording import counted
 
 
 def shift(
@@ -231,7 +232,7 @@ def record(
             )
             record_target_images(target_recording, workers=workers, ray=ray, progress=progress.show)
             message = (
-                f"{out}: {sum(image_count for _, image_count in images_per_town)} images, "
+                f"{out}: {counted(sum(image_count for _, image_count in images_per_town), 'image')}, "
                 f"annotations train.json, test.json and all.json"
             )
         else:
@@ -248,7 +249,6 @@ def record(
                 streets=streets,
             )
             record_nuscenes(recording, workers=workers, ray=ray, progress=progress.show)
-            message = (
-                f"{out}: {len(recording.towns) * scenes} scenes, version {recording.version}, splits train and val"
-            )
+            scene_count = counted(len(recording.towns) * scenes, "scene")
+            message = f"{out}: {scene_count}, version {recording.version}, splits train and val"
     print(message)

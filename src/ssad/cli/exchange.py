@@ -11,6 +11,7 @@ from ssad.cli import paths
 from ssad.cli.importing import Strict, check_yaml, show_report, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError, FormatError
+from ssad.core.wording import counted
 
 if TYPE_CHECKING:
     from ssad.world.roads.lanelet2 import Lanelet2Options
@@ -124,7 +125,7 @@ def import_map(
             progress=status.update,
             lanelet2=lanelet2,
         )
-    print(report.text(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}"))
+    print(report.text(f"town {town_name}: {counted(len(load_town(town_name).kind), 'lane')}, written to {path}"))
     print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 
 
@@ -177,7 +178,9 @@ def import_routes(
     towns = sorted({scenario.town for scenario in scenarios})
     if missing := [town for town in towns if not is_town(town)]:
         report.note(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE")
-    show_report(report, f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}", path)
+    show_report(
+        report, f"set {set_name}: {counted(len(scenarios), 'scenario')} on {', '.join(towns)}, written to {path}", path
+    )
 
 
 def import_drive(
@@ -212,4 +215,6 @@ def import_drive(
         store_town(imported_drive.graph, town, beside=out)
     save_scenarios(out, imported_drive.scenario)
     scenario = imported_drive.scenario
-    show_report(report, f"scenario {scenario.name}: {len(scenario.actors)} actors in {town}; written to {out}", out)
+    show_report(
+        report, f"scenario {scenario.name}: {counted(len(scenario.actors), 'actor')} in {town}; written to {out}", out
+    )

@@ -17,6 +17,7 @@ from ssad.core.jsonl import read_lines
 from ssad.core.machine import default_workers
 from ssad.core.registry import label_of
 from ssad.core.run_records import RESULTS
+from ssad.core.wording import counted
 from ssad.engine.kind import Plan, Resources
 from ssad.engine.run import run
 
@@ -141,7 +142,7 @@ def sampled_rates(plan: Plan, resources: Resources, sample: int) -> tuple[Rates,
         rows = run(replace(plan, cells=tuple(sampled_cells)), Path(temporary_folder) / "run", quiet_resources)
         rates.add(Path(temporary_folder) / "run", rows)
     failure_count = sum(row["status"] != "ok" for row in rows)
-    return rates, f"a sample of {len(sampled_cells)} cells" + (
+    return rates, f"a sample of {counted(len(sampled_cells), 'cell')}" + (
         f", of which {failure_count} failed" if failure_count else ""
     )
 

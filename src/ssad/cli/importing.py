@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from ssad.cli import paths
 from ssad.core.errors import ConfigError, FormatError
+from ssad.core.wording import counted
 
 if TYPE_CHECKING:
     from ssad.core.import_report import ImportReport
@@ -77,7 +78,7 @@ def export_scenarios(
         Format.commonroad: partial(export_commonroad, system=system),
     }
     files, omissions = writers[to](selected, out, seed=seed)
-    print(f"{len(selected)} scenarios: {len(files)} files written to {out}")
+    print(f"{counted(len(selected), 'scenario')}: {counted(len(files), 'file')} written to {out}")
     print_counted("not carried over", omissions)
 
 
@@ -114,9 +115,11 @@ def import_openscenario(
     save_scenarios(out, scenarios if len(scenarios) > 1 else scenarios[0])
     towns = ", ".join(sorted({scenario.town for scenario in scenarios}))
     if len(scenarios) > 1:
-        first_line = f"{len(scenarios)} scenarios in {towns}; written to {out}"
+        first_line = f"{counted(len(scenarios), 'scenario')} in {towns}; written to {out}"
     else:
-        first_line = f"scenario {scenarios[0].name}: {len(scenarios[0].actors)} actors in {towns}; written to {out}"
+        first_line = (
+            f"scenario {scenarios[0].name}: {counted(len(scenarios[0].actors), 'actor')} in {towns}; written to {out}"
+        )
     show_report(imported.report, first_line, out)
 
 
@@ -145,7 +148,7 @@ def import_leaderboard(
         report.refuse_doubts(FormatError)
     save_scenarios(out, imported)
     towns = ", ".join(sorted({scenario.town for scenario in imported}))
-    show_report(report, f"{len(imported)} scenarios on {towns}; written to {out}", out)
+    show_report(report, f"{counted(len(imported), 'scenario')} on {towns}; written to {out}", out)
 
 
 def import_commonroad(
@@ -176,7 +179,9 @@ def import_commonroad(
         store_town(imported.graph, town, beside=out)
     save_scenarios(out, imported.scenario)
     scenario = imported.scenario
-    show_report(report, f"scenario {scenario.name}: {len(scenario.actors)} actors in {town}; written to {out}", out)
+    show_report(
+        report, f"scenario {scenario.name}: {counted(len(scenario.actors), 'actor')} in {town}; written to {out}", out
+    )
 
 
 def import_scenic(
@@ -220,7 +225,7 @@ def import_scenic(
         report.refuse_doubts(FormatError)
     report.contents.append(f"{len(sampled)} of {count} samples, seeds {seed} to {seed + count - 1}")
     save_scenarios(out, sampled)
-    show_report(report, f"{len(sampled)} scenarios in {program.town}; written to {out}", out)
+    show_report(report, f"{counted(len(sampled), 'scenario')} in {program.town}; written to {out}", out)
 
 
 def check_yaml(out: Path) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
+from ssad.core.wording import counted
+
 
 def _scenario_list() -> dict[str, str]:
     from ssad.core.registry import names
@@ -14,10 +16,12 @@ def _scenario_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.sets import SHIPPED
 
     sets = {name: load_scenarios(name) for name in set_names()}
-    rows = {name: f"set of {len(scenarios)} scenarios" for name, scenarios in sets.items()}
+    rows = {name: f"set of {counted(len(scenarios), 'scenario')}" for name, scenarios in sets.items()}
     counts = Counter(scenario.type for name in SHIPPED for scenario in sets[name])
     for name, origin in names("scenario", SCENARIOS).items():
-        rows[name] = f"class with {counts[name]} scenarios" if name in SCENARIOS else f"class of your own: {origin}"
+        rows[name] = (
+            f"class with {counted(counts[name], 'scenario')}" if name in SCENARIOS else f"class of your own: {origin}"
+        )
     return rows | {
         scenario.name: f"{scenario.type} in {scenario.town}" for scenarios in sets.values() for scenario in scenarios
     }

@@ -11,6 +11,7 @@ from ssad.cli import paths
 from ssad.cli.importing import show_report
 from ssad.cli.options import Device
 from ssad.core.errors import ConfigError
+from ssad.core.wording import counted
 
 
 def detect(
@@ -79,7 +80,7 @@ def detect(
             if picture.problem:
                 refusals.append(picture.problem)
             else:
-                print(f"{picture.path}: {picture.count} boxes{''.join(f'; {note}' for note in picture.notes)}")
+                print("; ".join([f"{picture.path}: {counted(picture.count, 'box')}", *picture.notes]))
         print(f"boxes: {out / 'detections.json'}")
         for refusal in refusals:
             print(f"not read: {refusal}")

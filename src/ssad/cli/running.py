@@ -14,6 +14,7 @@ import typer
 from ssad.cli import paths
 from ssad.cli.options import Device, Dir, Ray, Workers
 from ssad.core.errors import ConfigError
+from ssad.core.wording import counted
 
 
 class Video(StrEnum):
@@ -146,7 +147,9 @@ def report(
     for problem in problems[:5]:
         print(problem)
     if problems:
-        print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
+        print(
+            f"{counted(len(problems), 'file')} changed since the run ended; what is made of them is not to be trusted"
+        )
         raise typer.Exit(1)
 
 
@@ -252,7 +255,7 @@ def replay(
         raise typer.Exit(1 if replayed.difference else 0)
     save_trace(stem.with_suffix(".npz"), replayed.trace)
     video_path = write_video(replayed.trace, replayed.graph, stem.with_suffix(f".{video.value}"))
-    print(f"{replayed.cell.key} {replayed.cell.name}: {len(replayed.trace.accel) - 1} steps, {verdict}")
+    print(f"{replayed.cell.key} {replayed.cell.name}: {counted(len(replayed.trace.accel) - 1, 'step')}, {verdict}")
     print(f"video: {video_path}\ntrace: {stem.with_suffix('.npz')}")
     if replayed.film is not None:
         camera_frames, dt = replayed.film

@@ -10,6 +10,7 @@ from typing import Any, get_args
 from rich.console import Console
 
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
+from ssad.core.wording import counted
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
@@ -118,7 +119,7 @@ def shift_folder(
             print(f"  ... and {len(root.reasons) - 3} more: see {root.root / 'manifest'}")
     if failure_count:
         print(
-            f"{failure_count} files failed, so their roots are incomplete and cannot be scored; "
+            f"{counted(failure_count, 'file')} failed, so their roots are incomplete and cannot be scored; "
             "fix these files in the dataset and repeat the command"
         )
     return int(failure_count > 0)
@@ -206,7 +207,7 @@ def verify_folder(out: Path) -> int:
     for root in roots:
         file_count, problems = verify(root)
         mismatch_count += len(problems)
-        print(f"{root}: {file_count} files, {len(problems)} differ from the manifest")
+        print(f"{root}: {counted(file_count, 'file')}, {len(problems)} differ from the manifest")
         for problem in problems[:5]:
             print(f"  {problem}")
     return int(mismatch_count > 0)

@@ -107,27 +107,76 @@ def train_driver(
 @train_app.command("adversary")
 def train_adversary(
     algorithm: Annotated[
-        str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea, adv-sac, adv-ddpg or adv-dqn.")
+        str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, adv-ppo-paper, frea, adv-sac, adv-ddpg or adv-dqn.")
     ] = "adv-ppo",
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[
         str,
-        typer.Option(help="Comma-separated sets or files with background traffic (training; for frea training-lanes)."),
+        typer.Option(help="Comma-separated sets or files with background traffic.  [default: training,training-lanes]"),
     ] = "",
     test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "natural",
     literal: Annotated[bool, typer.Option("--literal", help="Reward as equation 6 of the paper prints it.")] = False,
-    off_road: Annotated[float, typer.Option(min=0.0, help="What a step off the road costs; in the paper 0.")] = 0.5,
+    off_road: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="What a step off the road costs.  [default: 0.5; for adv-ppo-paper 0]"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
     change: Changes = None,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
+    region: Annotated[
+        Path | None,
+        typer.Option(help="Weights of a feasible region as a second critic.  [default: for frea the shipped one]"),
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where the networks are trained: cpu or cuda.")] = "cpu",
 ) -> None:
     """Train an adversary against a driving system (needs the extra train). To resume, repeat the command."""
+    paths.check_exists(region)
     paths.check_out(out, paths.TRAINING)
     from ssad.training.adversary import AdversaryPlan, run_adversary_training
     from ssad.training.detector import parse_changes
 
     plan = AdversaryPlan(
-        algorithm, out, ego, _names(scenarios), _names(test), literal, off_road, parse_changes(change or []), seconds
+        algorithm,
+        out,
+        ego,
+        _names(scenarios),
+        _names(test),
+        literal,
+        off_road,
+        parse_changes(change or []),
+        seconds,
+        region,
+        device,
     )
     for line in run_adversary_training(plan, report=lambda text: print(text, flush=True)):
+        print(line)
+
+
+@train_app.command("feasible-region")
+def train_feasible_region(
+    scenarios: Annotated[
+        str, typer.Option(help="Comma-separated sets or files with background traffic to record drives in.")
+    ] = "training,training-lanes",
+    egos: Annotated[str, typer.Option(help="Comma-separated driving systems at the wheel, in turn.")] = "autopilot,ppo",
+    adversaries: Annotated[
+        str, typer.Option(help="Comma-separated shipped adversaries in their way, in turn; none: natural traffic.")
+    ] = "adv-ppo-paper,adv-ddpg,none",
+    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("training"),
+    change: Changes = None,
+    device: Annotated[str, typer.Option(help="Where the networks are trained: cpu or cuda.")] = "cpu",
+) -> None:
+    """Learn offline which states leave the ego a way out: the second critic of the adversary frea."""
+    paths.check_out(out, paths.TRAINING)
+    from ssad.training.detector import parse_changes
+    from ssad.training.feasibility import RegionPlan, run_region_training
+
+    plan = RegionPlan(
+        out,
+        _names(scenarios),
+        _names(egos),
+        _names(adversaries),
+        parse_changes(change or []),
+        device,
+    )
+    for line in run_region_training(plan, report=lambda text: print(text, flush=True)):
         print(line)

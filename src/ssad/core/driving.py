@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, F64, I32, U8, AgentKind, Bool, Controller, Episode
+from ssad.core.types import F32, F64, I8, I32, U8, AgentKind, Bool, Controller, Episode
 
 Scenes = Sequence[int] | npt.NDArray[np.integer[Any]]
 
@@ -97,6 +97,8 @@ class WorldState:
         stop_sign: [B] stop signs run in this step; None in a world without stop signs.
         note: [B, A] note of a selector on an agent (`Choice.note`), 0 at the start; None in a simulator without
             notes.
+        turn_signals: Function that returns `turn_signal`, called on first use; None in a simulator without turn
+            signals.
     """
 
     time: F64
@@ -127,11 +129,19 @@ class WorldState:
     red_light: U8
     stop_sign: U8 | None = None
     note: I32 | None = None
+    turn_signals: Callable[[], I8] | None = None
 
     @cached_property
     def signal(self) -> U8:
         """`ssad.core.types.SignalState` [B, S] of the signals of each scene's town; S of the town with most."""
         return self.signals()
+
+    @cached_property
+    def turn_signal(self) -> I8:
+        """`ssad.core.types.TurnSignal` [B, A]: of Autopilots before and in lane changes and turns; of others 0."""
+        if self.turn_signals is None:
+            return np.zeros(self.speed.shape, np.int8)
+        return self.turn_signals()
 
 
 class LaneRelation(IntEnum):
@@ -169,6 +179,7 @@ class Observation:
         signal: [N, 2] state of the next signal on the route (`ssad.core.types.SignalState`) and metres to its
             stop line. Without a signal: 0 (off) and 1e6.
         done: [N] whether the episode has ended; the control is then ignored.
+        others_turn_signal: [N, 16] `ssad.core.types.TurnSignal` of the agents in `others`; None: not known.
         readings: Readings of the driver's sensors by name, [N, ...] each; `truth` is a `Belief` of N rows. Each
             is read on first access, which must be before the driver returns.
     """
@@ -187,6 +198,7 @@ class Observation:
     others_lane: U8
     signal: F32
     done: Bool
+    others_turn_signal: I8 | None = None
     readings: Mapping[str, Any] = field(default_factory=dict)
 
 

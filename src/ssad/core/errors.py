@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
+from ssad.core.wording import plural
+
 MAX_MESSAGE = 2000  # characters
 
 
@@ -93,11 +95,6 @@ LISTED = (
     "town",
 )
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
-
-
-def plural(noun: str) -> str:
-    """Return the plural of a noun: "system" -> "systems", "loss" -> "losses"."""
-    return f"{noun}es" if noun.endswith("s") else f"{noun}s"
 
 
 def unknown_name(kind: str, name: str, known_names: Iterable[str]) -> UnknownNameError:

@@ -23,7 +23,7 @@ from typing import Protocol, runtime_checkable
 
 from ssad.core.driving import Driver, Selector
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Episode, EpisodeTrace, Scenario
+from ssad.core.types import MOVING, Episode, EpisodeTrace, Scenario
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ class Outcome:
         ego_speed: Speed of the ego then, m/s.
         gap: Minimum distance of the ego's body from an adversary's, m; 0 if they touched. None: no adversary
             present.
-        off_road: Whether an adversary that is a vehicle was on the road, on the side of its direction, and left it.
+        off_road: Whether an adversary that is a vehicle was on the road, on the side of its direction, and left it; a
+            cyclist may leave the road, but not ride against traffic.
         hit_others: Whether an adversary touched an agent other than the ego.
         acceleration: Largest acceleration of an adversary that is a vehicle from one step to the next, along its
             heading or across, m/s^2.
@@ -117,6 +118,22 @@ class Outcome:
         if self.collision:
             return 0.1 * (self.impact_speed or 0.0) if self.is_valid else -1.0
         return -100.0 if self.gap is None else max(-self.gap, -100.0)
+
+    @property
+    def is_provable(self) -> bool:
+        """True if the collision is valid and the ego moves: what a search can do for a proven collision."""
+        return self.is_valid and self.ego_speed is not None and self.ego_speed > MOVING
+
+    @property
+    def proof_value(self) -> float:
+        """Scalar objective for searches that seek proven collisions; larger is better.
+
+        As `danger`, with 1 more for a collision that may be proven; a valid one with an ego that stands counts as a gap
+        of half a metre.
+        """
+        if self.is_provable:
+            return 1.0 + self.danger
+        return -0.5 if self.is_valid else self.danger
 
 
 @runtime_checkable

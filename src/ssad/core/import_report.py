@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ssad.core.errors import SSADError
+from ssad.core.wording import wrapped_line
 
 EXAMPLES = 4  # places named in a line
-COLUMNS = 80  # of a line of text
 
 
 @dataclass
@@ -92,10 +91,7 @@ def report_path(result: Path) -> Path:
 
 def wrapped(lines: Iterable[str]) -> str:
     """Return lines of at most 80 columns each; what continues a line is indented. Paths are never broken."""
-    return "\n".join(
-        textwrap.fill(line, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
-        for line in lines
-    )
+    return "\n".join(map(wrapped_line, lines))
 
 
 def _first(lines: Mapping[str, Sequence[str]], word: str) -> str:

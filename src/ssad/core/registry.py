@@ -21,7 +21,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, plural, unknown_name
+from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, unknown_name
+from ssad.core.wording import plural
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ BODY = {
 }
 VEHICLE = (234, 138, 30)
 LAMP = {1: (220, 38, 38), 2: (234, 179, 8), 3: (34, 197, 94)}
+INDICATOR = (251, 191, 36)
+FLASHES = 1.5  # flashes of turn signals a second: 90 +- 30 a minute (Swiss VTS, article 79; UN Regulation 48)
 _SHIFT = 4  # OpenCV draws at 1/16 pixel
 
 
@@ -83,6 +85,7 @@ class TopViewScene:
         lamps: x, y (m) and `ssad.core.types.SignalState` of traffic lights.
         hit: Steps since the ego's first contact; None without one.
         words: Lines in the upper left corner.
+        turn_signal: `ssad.core.types.TurnSignal` of the agents whose lamp is lit at this moment [A]; None: no lamps.
     """
 
     pose: npt.NDArray[np.floating]
@@ -94,6 +97,13 @@ class TopViewScene:
     lamps: Sequence[tuple[float, float, int]] = ()
     hit: int | None = None
     words: Sequence[str] = ()
+    turn_signal: npt.NDArray[np.integer] | None = None
+
+
+def lit_turn_signals(turn_signal: npt.NDArray[np.integer], time: float) -> npt.NDArray[np.integer]:
+    """Return the turn signals [A] at a time (s): dark in the second half of each flash."""
+    is_lit = int(2.0 * FLASHES * time + 1e-6) % 2 == 0
+    return turn_signal if is_lit else np.zeros_like(turn_signal)
 
 
 class TopView:
@@ -156,3 +166,9 @@ def _agent(canvas: _Canvas, scene: TopViewScene, agent: int) -> None:
         nose_offset = 0.28 * length
         nose = corners(x + nose_offset * np.cos(yaw), y + nose_offset * np.sin(yaw), yaw, 0.12 * length, 0.8 * width)
         canvas.fill(nose, (226, 232, 240))
+    side = 0 if scene.turn_signal is None else int(scene.turn_signal[agent])
+    if side:
+        left = 0.5 * side * width
+        for ahead in (0.5 * length, -0.5 * length):
+            lamp_x, lamp_y = ahead * np.cos(yaw) - left * np.sin(yaw), ahead * np.sin(yaw) + left * np.cos(yaw)
+            canvas.disc(x + lamp_x, y + lamp_y, 0.35, INDICATOR)

@@ -33,7 +33,10 @@ def _meta(trace: EpisodeTrace) -> dict[str, Any]:
 
 
 def _arrays(trace: EpisodeTrace) -> dict[str, npt.NDArray[Any]]:
-    return {name: np.ascontiguousarray(getattr(trace, name), dtype) for name, dtype in _ARRAYS.items()}
+    arrays = {name: np.ascontiguousarray(getattr(trace, name), dtype) for name, dtype in _ARRAYS.items()}
+    if not arrays["turn_signal"].size:
+        del arrays["turn_signal"]  # likewise: the hash of such a trace is that of earlier versions
+    return arrays
 
 
 def merge_steps(trace: EpisodeTrace, count: int) -> EpisodeTrace:
@@ -51,6 +54,8 @@ def merge_steps(trace: EpisodeTrace, count: int) -> EpisodeTrace:
     ends = np.unique([0, *range(count, row_count, count), row_count - 1])
     starts = np.concatenate([[0], ends[:-1] + 1])
     merged: dict[str, Any] = {name: getattr(trace, name)[ends] for name in _PER_STEP}
+    if trace.turn_signal.size:
+        merged["turn_signal"] = trace.turn_signal[ends]
     for name in ("lane_invasion", "red_light", "stop_sign"):
         merged[name] = np.add.reduceat(getattr(trace, name), starts).astype(getattr(trace, name).dtype)
     merged["contact"] = np.bitwise_or.reduceat(trace.contact, starts)
@@ -87,6 +92,7 @@ def load_trace(path: str | Path) -> EpisodeTrace:
     if not isinstance(meta, dict) or meta.pop("format", None) != FORMAT:
         raise FormatError(f"{path}: an episode trace of another format; run the suite again into a new folder")
     meta.setdefault("heights", ())
+    stored.setdefault("turn_signal", np.zeros((0, 0), np.int8))
     missing = (set(_META) - set(meta)) | (set(_ARRAYS) - set(stored))
     mistyped = [name for name, dtype in _ARRAYS.items() if name in stored and stored[name].dtype != dtype]
     if missing or mistyped:
@@ -95,6 +101,8 @@ def load_trace(path: str | Path) -> EpisodeTrace:
     for name in _PER_AGENT:
         if stored[name].shape != (steps, agents):
             raise FormatError(f"{path}: not a whole episode trace ({name} has shape {stored[name].shape})")
+    if stored["turn_signal"].shape not in ((0, 0), (steps, agents)):
+        raise FormatError(f"{path}: not a whole episode trace (turn_signal has shape {stored['turn_signal'].shape})")
     heights = meta["heights"]
     if not isinstance(heights, list | tuple) or (
         heights and (len(heights) != agents or not all(isinstance(value, float) and value > 0.0 for value in heights))
@@ -127,7 +135,10 @@ def first_difference(first: EpisodeTrace, second: EpisodeTrace) -> str | None:
     for name in _META:
         if _meta(first).get(name) != _meta(second).get(name):
             return f"{name}: {_meta(first).get(name)!r} against {_meta(second).get(name)!r}"
-    left_arrays, right_arrays = _arrays(first), _arrays(second)
+    left_arrays, right_arrays = (
+        {name: np.ascontiguousarray(getattr(trace, name), dtype) for name, dtype in _ARRAYS.items()}
+        for trace in (first, second)
+    )
     differences: list[tuple[int, str]] = []
     for name in _ARRAYS:
         left_array, right_array = left_arrays[name], right_arrays[name]

@@ -18,10 +18,11 @@ import numpy.typing as npt
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+I8 = npt.NDArray[np.int8]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
-_DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
+_DTYPES = {"F32": np.float32, "F64": np.float64, "I8": np.int8, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
 
 
 def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
@@ -31,13 +32,21 @@ def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
         table: A dataclass with postponed annotations.
 
     Returns:
-        Name -> dtype of the constructor's fields annotated F32, F64, I32, U8 or Bool, in their order.
+        Name -> dtype of the constructor's fields annotated F32, F64, I8, I32, U8 or Bool, in their order.
     """
     return {
         table_field.name: np.dtype(_DTYPES[str(table_field.type)])
         for table_field in fields(table)
         if table_field.init and str(table_field.type) in _DTYPES
     }
+
+
+class TurnSignal(IntEnum):
+    """Turn signal that a vehicle shows."""
+
+    RIGHT = -1
+    NONE = 0
+    LEFT = 1
 
 
 class LaneType(IntEnum):
@@ -165,6 +174,7 @@ class Body:
 
 
 DEFAULT_FRICTION = 0.9  # of a dry road
+MOVING = 0.5  # m/s; an agent that is slower stands
 
 
 @dataclass(frozen=True)
@@ -450,6 +460,10 @@ class SignalPlan:
     elsewhere: Literal["program", "off", "red", "green"] = "program"
 
 
+MOST_ERRORS = 1800.0
+"""Errors of a driver an hour at most: one error after the other, 2 s each."""
+
+
 @dataclass(frozen=True)
 class DriverStyle:
     """Parameters of one driver of background traffic, in place of those that all Autopilots have.
@@ -466,6 +480,8 @@ class DriverStyle:
         lane_offset: Mean place left of the middle of the lane, m.
         errors: Errors an hour: a moment in which the driver reacts late and misses who has priority.
         key: Number from which the driver's errors are drawn, below 2^24.
+        politeness: Weight of the acceleration that a lane change costs or brings others (MOBIL).
+        change_duration: Time that a lane change takes where there is room, s.
     """
 
     time_gap: float
@@ -479,6 +495,50 @@ class DriverStyle:
     lane_offset: float = 0.0
     errors: float = 0.0
     key: int = 0
+    politeness: float = 0.35
+    change_duration: float = 5.0
+
+
+@dataclass(frozen=True)
+class WalkCrossing:
+    """Place at which a walker's route leads over a road. Distances are along the route.
+
+    Attributes:
+        crossing: Number of the crossing in `ssad.world.roads.sidewalks.sidewalk_network`.
+        wait: Distance to where the walker waits, m.
+        kerb: Distance to the edge of the road, m.
+        far: Distance to its opposite edge, m.
+        forward: Whether it walks from the first end of the crossing to the second.
+    """
+
+    crossing: int
+    wait: float
+    kerb: float
+    far: float
+    forward: bool
+
+
+@dataclass(frozen=True)
+class WalkStyle:
+    """Behaviour of a walker of natural traffic, in place of phases.
+
+    Attributes:
+        crossings: Roads that it crosses on its way, in order.
+        margin: Time between itself and a vehicle with which it is content when it enters a road, s.
+        room: Half width that its way offers to it, m.
+        offset: Mean place left of the middle of the pavement, m.
+        group: Name of the walker that decides when its group crosses; "": it decides itself.
+        row: Distance at which it walks behind that one, m.
+        depth: Distance from it to the last one that follows it, m.
+    """
+
+    crossings: tuple[WalkCrossing, ...] = ()
+    margin: float = 2.0
+    room: float = 1.0
+    offset: float = 0.0
+    group: str = ""
+    row: float = 0.0
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -493,8 +553,9 @@ class TrafficPlan:
         draw: Number of the draw of vehicles, which is then the same in every episode; None: the episode's seed.
         drivers: `uniform`: all vehicles have the Autopilot's parameters. `population`: each has a driver drawn from
             published distributions.
-        errors: Errors of each driver of the population an hour; see `DriverStyle`.
+        errors: Errors of each driver of the population an hour, at most `MOST_ERRORS`; see `DriverStyle`.
         walkers: Number of walkers on the sidewalks near the route, alone and in groups; fewer where there is no room.
+            They cross roads.
         cyclists: Number of cyclists on the driving lanes near the route; fewer where there is no room.
     """
 
@@ -643,6 +704,7 @@ class EpisodeAgent:
         driver: Parameters of its driver under AUTOPILOT; None: those that all Autopilots have.
         lateral: Lateral phases under SCRIPT; they need a route.
         lateral_targets: Distance left of the route to which each lateral phase leads, at every route point [N], m.
+        walk: Behaviour of a walker of natural traffic under SCRIPT; it needs a route and has no phases.
     """
 
     name: str
@@ -660,6 +722,7 @@ class EpisodeAgent:
     lateral: tuple[LateralPhase, ...] = ()
     lateral_targets: tuple[F32, ...] = ()
     driver: DriverStyle | None = None
+    walk: WalkStyle | None = None
 
 
 @dataclass(frozen=True)
@@ -727,6 +790,7 @@ class EpisodeTrace:
         route: The ego's route [N, 2], m.
         end: Reason of the end (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
         heights: Heights of the agents, m; empty where all agents have the dimensions of their models.
+        turn_signal: `TurnSignal` of the agents [T, A]; [0, 0] in an episode without drivers of the population.
     """
 
     key: str
@@ -760,3 +824,4 @@ class EpisodeTrace:
     route: F32
     end: str
     heights: tuple[float, ...] = ()
+    turn_signal: I8 = field(default_factory=lambda: np.zeros((0, 0), np.int8))

@@ -18,6 +18,7 @@ from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import F64, U8
+from ssad.core.wording import counted
 from ssad.datasets.drawing import draw_edges
 from ssad.datasets.nuscenes.camera_truth import boxes_in_picture
 from ssad.datasets.nuscenes.files import read_frame_image, read_frame_points
@@ -139,10 +140,10 @@ def _write_scene(root: Path, scene: SceneData, folder: Path, moments: int) -> di
             save_picture(folder / view_name, draw_top_view(root, lidar, boxes))
         seconds = (scene.samples[sample_index].timestamp - scene.samples[0].timestamp) / 1e6
         moment_entries.append(
-            {"title": f"{seconds:.1f} s, {len(boxes)} boxes", "pictures": pictures, "above": view_name}
+            {"title": f"{seconds:.1f} s, {counted(len(boxes), 'box')}", "pictures": pictures, "above": view_name}
         )
     description = scene.record.description.rstrip(". ")
-    summary = f"{description}. {len(scene.samples)} samples.".lstrip(". ")
+    summary = f"{description}. {counted(len(scene.samples), 'sample')}.".lstrip(". ")
     return {"name": scene.record.name, "about": summary, "counts": counts.most_common(), "moments": moment_entries}
 
 

@@ -14,6 +14,7 @@ from ssad.core.errors import FormatError
 from ssad.core.folders import data_path
 from ssad.core.import_report import ImportReport
 from ssad.core.types import F64, I32, Bool
+from ssad.core.wording import counted
 
 MAX_FILE_BYTES: Final = 1 << 30  # size limit of an annotation file
 
@@ -142,7 +143,10 @@ def read_coco(path: Path, *, images: Path | None = None, report: ImportReport | 
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
     if report is not None:
         box_count = sum(len(picture.box) for picture in pictures)
-        report.contents.append(f"{len(pictures)} pictures with {box_count} boxes of {len(class_names)} classes")
+        report.contents.append(
+            f"{counted(len(pictures), 'picture')} with {counted(box_count, 'box')} of "
+            f"{counted(len(class_names), 'class')}"
+        )
         for key in ("segmentation", "keypoints", "caption"):
             if count := sum(bool(record.get(key)) for record in content["annotations"]):
                 report.omit(f"{key} of annotations", count=count)

@@ -13,6 +13,7 @@ from ssad.core.errors import FormatError, StoreError
 from ssad.core.folders import is_linkable, link_remedy
 from ssad.core.image_files import is_image
 from ssad.core.import_report import ImportReport
+from ssad.core.wording import counted
 from ssad.datasets.point_files import KITTI_COLUMNS, NUSCENES_COLUMNS
 
 Kind = Literal["image", "points", "label", "other", "link", "refused"]
@@ -104,7 +105,7 @@ def folder_report(root: Path) -> ImportReport:
     report = ImportReport(str(root))
     files = list_folder(root)
     counts = Counter(file.kind for file in files)
-    report.contents.append(f"{counts['image']} pictures, {counts['points']} point clouds")
+    report.contents.append(f"{counted(counts['image'], 'picture')}, {counts['points']} point clouds")
     for file in files:
         if file.kind == "label":
             report.omit("pictures in folders of labels", file.key)

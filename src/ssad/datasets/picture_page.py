@@ -16,6 +16,7 @@ from ssad.core.image_files import GREY_NOTE, read_image_file
 from ssad.core.images import save_picture
 from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import U8
+from ssad.core.wording import counted
 from ssad.datasets.browse import GROUND, STYLE, VIEW_RANGE, VIEW_SIZE, WIDTH, draw_points
 from ssad.datasets.picture_folders import FolderFile, list_folder
 from ssad.datasets.point_files import read_point_file
@@ -117,7 +118,7 @@ def _draw(file: FolderFile) -> tuple[U8, str]:
         point_file = read_point_file(file.path, columns=file.point_columns)
         canvas: U8 = np.full((VIEW_SIZE, VIEW_SIZE, 3), GROUND, np.uint8)
         draw_points(canvas, point_file.points[:, :3].astype(np.float64), road_height=-LIDAR_HEIGHT)
-        return canvas, f"{len(point_file.points)} points"
+        return canvas, f"{counted(len(point_file.points), 'point')}"
     image_file = read_image_file(file.path)
     image = image_file.rgb
     height, width = image.shape[:2]

@@ -25,6 +25,7 @@ from ssad.core.run_records import UNIT_LIMITS, ValueLimits
 from ssad.core.seeding import digest
 from ssad.core.source import source_version
 from ssad.core.types import U8, EpisodeTrace
+from ssad.core.wording import counted
 from ssad.report import default
 from ssad.report.load import Run
 from ssad.report.tables import Table
@@ -427,6 +428,8 @@ def find_cell(cells: Sequence[Cell], name_or_key: str) -> Cell:
         return matches[0]
     if matches:
         examples = ", ".join(f"{cell.key} ({cell.name})" for cell in matches[:3])
-        raise ConfigError(f"'{name_or_key}' means {len(matches)} cells: {examples} ...; give more of the key")
+        raise ConfigError(
+            f"'{name_or_key}' means {counted(len(matches), 'cell')}: {examples} ...; give more of the key"
+        )
     suggestions = difflib.get_close_matches(name_or_key, [cell.name for cell in cells], n=3, cutoff=0.0)
     raise ConfigError(f"no cell '{name_or_key}' in this run; closest: {', '.join(suggestions)}")

@@ -12,6 +12,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.registry import label_of
+from ssad.core.wording import counted
 from ssad.engine.kind import Cell, Kind, Plan, SuiteBase
 from ssad.experiments.suites import KINDS, kind_of
 from ssad.metrics.intervals import MIN_ROUTES
@@ -77,7 +78,8 @@ def sample_line(plan: Plan) -> str:
     """Return the number of cases and clusters of a plan in words."""
     sample = sample_of(plan)
     cells_per_case = max(Counter(_case(cell) for cell in plan.cells).values())
-    return f"cases: {sample.cases:.0f} in {sample.clusters:.0f} clusters, each met by up to {cells_per_case} cells"
+    cell_count = counted(cells_per_case, "cell")
+    return f"cases: {sample.cases:.0f} in {counted(sample.clusters, 'cluster')}, each met by up to {cell_count}"
 
 
 def check_rates(suite: SuiteBase) -> None:
@@ -260,7 +262,7 @@ def _rows(needs: Mapping[str, Sequence[Need]], sample: CaseSample) -> Iterator[t
 
 def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, sample: CaseSample) -> Iterator[str]:
     """Yield sentences about the suite, the measured flip rates and the columns."""
-    size = f"The suite has {sample.cases:.0f} cases in {sample.clusters:.0f} clusters"
+    size = f"The suite has {counted(sample.cases, 'case')} in {counted(sample.clusters, 'cluster')}"
     first_needs = next(iter(needs.values()))
     if sample.clusters < MIN_ROUTES:
         yield f"{size}: with fewer than {MIN_ROUTES} there is no interval, and no difference is detected."

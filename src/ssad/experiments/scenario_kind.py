@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -16,9 +16,10 @@ from ssad.core.folders import path_inside
 from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import to_plain_json
+from ssad.core.schema import Schema
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
-from ssad.core.types import Episode, EpisodeTrace, Scenario
+from ssad.core.types import MOST_ERRORS, Episode, EpisodeTrace, Scenario
 from ssad.engine.kind import Cell, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.metrics import episode_metrics
 from ssad.simulators.closed_loop import (
@@ -53,6 +54,23 @@ def _check_grid(entry: Any) -> Any:
     return entry
 
 
+class TrafficSuite(Schema):
+    """Changes of the background traffic of scenarios; keys that are left out change nothing.
+
+    Attributes:
+        drivers: uniform, all vehicles with the Autopilot's parameters, or population, each with a driver drawn from
+            published distributions (docs/explanation/traffic.md).
+        errors: Errors of each driver of the population an hour.
+        walkers: Number of walkers near the route.
+        cyclists: Number of cyclists near the route.
+    """
+
+    drivers: Literal["uniform", "population"] | None = None
+    errors: float | None = Field(default=None, ge=0.0, le=MOST_ERRORS, allow_inf_nan=False)
+    walkers: int | None = Field(default=None, ge=0, le=40)
+    cyclists: int | None = Field(default=None, ge=0, le=40)
+
+
 class ScenarioSuite(SuiteBase):
     """Keys of suites that drive scenarios.
 
@@ -61,6 +79,8 @@ class ScenarioSuite(SuiteBase):
             that simulator's intersection and highway.
         cluster: What is drawn independently of one another, for the intervals: towns' routes, each of which may have
             several scenarios, or scenarios.
+        traffic: Changes of the background traffic of the scenarios that have some. Seeds stay the same, and with them
+            the vehicles.
         sweep: Parameter of the scenarios -> its values: a list, {from: 0, to: 1, step: 0.25}, {from: 0, to: 1,
             count: 5}, or grid for those that the scenario declares. Each point of the grid is a scenario
             (docs/how-to/sweep-parameters.md).
@@ -73,6 +93,7 @@ class ScenarioSuite(SuiteBase):
 
     scenarios: Names
     cluster: Literal["route", "scenario"] = "route"
+    traffic: TrafficSuite = TrafficSuite()
     sweep: dict[str, Annotated[Any, AfterValidator(_check_grid)]] = Field(default={})
     sweep_mode: Literal["product", "zip"] = "product"
     matrix: Annotated[list[str], Field(max_length=2)] = Field(default=[])
@@ -115,7 +136,7 @@ class DescribedScenario:
         scenario: The scenario.
         data: Its plain data.
         versions: The versions.
-        nominal: The scenario that a sweep varies; the scenario itself without a sweep.
+        nominal: The scenario as it was loaded, which the suite's traffic and a sweep vary; its seed is theirs.
         point: Values of swept parameters.
     """
 
@@ -254,6 +275,9 @@ def describe_scenarios(suite: ScenarioSuite, metrics: Iterable[str]) -> tuple[li
     if suite.matrix_metric and suite.matrix_metric not in metrics:
         raise suite.error(("matrix_metric",), str(unknown_name("metric", suite.matrix_metric, metrics)))
     nominal_scenarios = suite_scenarios(suite)
+    varied = {scenario.name: with_suite_traffic(suite, scenario) for scenario in nominal_scenarios}
+    if suite.traffic != TrafficSuite() and all(varied[scenario.name] is scenario for scenario in nominal_scenarios):
+        raise suite.error(("traffic",), "none of the scenarios has background traffic to change")
     towns = {
         name: town_version(cached_town(name)) for name in sorted({scenario.town for scenario in nominal_scenarios})
     }
@@ -261,13 +285,38 @@ def describe_scenarios(suite: ScenarioSuite, metrics: Iterable[str]) -> tuple[li
     for nominal in nominal_scenarios:
         policies = [system_version(name) for name in policies_of(nominal)]
         versions = (towns[nominal.town], type_version(nominal.type), *policies)
+        changed = varied[nominal.name]
         if not suite.sweep:
-            entries.append(DescribedScenario(nominal, scenario_json(nominal), versions, nominal, {}))
+            entries.append(DescribedScenario(changed, scenario_json(changed), versions, nominal, {}))
         entries += [
             DescribedScenario(point.scenario, scenario_json(point.scenario), versions, nominal, point.values)
-            for point in (swept_points(suite, nominal) if suite.sweep else ())
+            for point in (swept_points(suite, changed) if suite.sweep else ())
         ]
     return entries, towns
+
+
+def with_suite_traffic(suite: ScenarioSuite, scenario: Scenario) -> Scenario:
+    """Return a scenario with the suite's changes of its background traffic; itself if it has none.
+
+    Raises:
+        ConfigError: The traffic is not valid; the message names the key, and its line where the suite has a file.
+    """
+    from ssad.scenarios.dynamic.catalogue import scenario_type
+    from ssad.scenarios.dynamic.schema import check
+
+    changes = suite.traffic.model_dump(exclude_none=True)
+    if not changes:
+        return scenario
+    # A scenario that states no traffic has that of its type.
+    traffic_plan = scenario.traffic or scenario_type(scenario.type).traffic
+    if traffic_plan is None:
+        return scenario
+    changed = replace(scenario, traffic=replace(traffic_plan, **changes))
+    try:
+        check(changed)
+    except ConfigError as error:
+        raise suite.error(("traffic",), str(error)) from None
+    return changed
 
 
 def swept_points(suite: ScenarioSuite, scenario: Scenario) -> tuple[GridPoint, ...]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F64, LaneType, SignalState
+from ssad.core.wording import counted
 from ssad.interchange import commonroad_xml as xml
 from ssad.interchange.commonroad_xml import add_element
 from ssad.scenarios.dynamic.knowledge._placing import turn_of
@@ -83,7 +84,7 @@ def write_lanes(
         _write_light(root, light_id, graph.signal_xy[index], forced.get(index), programs[index].tolist(), dt)
     _write_intersections(root, graph, ids)
     hidden_count = len(graph.signal_phase) - len(signal_indices)
-    omissions = [f"{hidden_count} places of signals that the map does not have"] if hidden_count else []
+    omissions = [f"{counted(hidden_count, 'place')} of signals that the map does not have"] if hidden_count else []
     return ids.next, omissions
 
 

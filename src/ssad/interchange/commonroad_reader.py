@@ -21,6 +21,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import F64, EpisodeLimits, LaneType, Pose, Route, Scenario, SignalPlan
+from ssad.core.wording import counted
 from ssad.interchange.commonroad_lanelets import ImportedLanes, read_lanes
 from ssad.interchange.commonroad_obstacles import ObstacleReader
 from ssad.interchange.commonroad_other import convert, is_protobuf
@@ -176,7 +177,7 @@ class _Reader:
             end_time = self.texts.number(self.own_values["signals_until"], self.root, "source: signals_until")
         plan = plan_of(graph, line, forced_states, end_time) if len(forced_states) == len(lanes.states) else None
         if plan is None:
-            self.report.omit(f"the states of {len(lanes.states)} signals, which no signal plan here gives")
+            self.report.omit(f"the states of {counted(len(lanes.states), 'signal')}, which no signal plan here gives")
         return plan or SignalPlan()
 
     # ------------------------------------------------------------ the ego

@@ -19,6 +19,7 @@ from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.core.types import F64, Actor, EpisodeLimits, Pose, Scenario, SignalPlan
+from ssad.core.wording import counted
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
@@ -134,7 +135,7 @@ def scenario_of_drive(
     build_episode(scenario, graph, seed=0)
     account.contents += [
         f"nuScenes schema {data.version}, scene {scene_data.record.name}: {len(scene_data.samples)} key frames",
-        f"the ego drives {way:.0f} m in {graph.name}; {len(scenario.actors)} actors repeat their motion",
+        f"the ego drives {way:.0f} m in {graph.name}; {counted(len(scenario.actors), 'actor')} with logged motion",
     ]
     if not is_known:
         account.note("the map of the log is not read: lanes follow the paths that were driven")

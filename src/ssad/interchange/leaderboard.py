@@ -24,6 +24,7 @@ from ssad.core.import_report import ImportReport
 from ssad.core.safeio import MIB, dump_json, make_folder, read_xml, write_atomic
 from ssad.core.seeding import generator
 from ssad.core.types import Episode, Pose, Scenario
+from ssad.core.wording import counted
 from ssad.interchange.export import ExportedFiles, episode
 from ssad.interchange.leaderboard_site import LIMITS, ScenarioBuilder
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, add_no_actors
@@ -151,8 +152,8 @@ def read_leaderboard(
     progress(len(routes), len(routes))
     free_drives = sum(scenario.type == FREE_DRIVE for scenario in scenarios)
     account.contents.append(
-        f"{len(routes)} routes: {len(scenarios) - free_drives} scenarios, {free_drives} free drives of routes without"
-        " scenarios"
+        f"{counted(len(routes), 'route')}: {counted(len(scenarios) - free_drives, 'scenario')}, "
+        f"{counted(free_drives, 'free drive')} of routes without scenarios"
     )
     return tuple(scenarios)
 

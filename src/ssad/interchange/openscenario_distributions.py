@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from ssad.core.errors import FormatError
 from ssad.core.expressions import text_of
 from ssad.core.seeding import generator
-from ssad.interchange.openscenario_document import AttributeReader
+from ssad.interchange.openscenario_document import AttributeReader, declarations, undeclared
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -88,6 +88,26 @@ def parameter_sets(root: Element, path: Path, *, count: int | None = None) -> tu
             drawn.add(int(random.integers(set_count)))
         numbers = sorted(drawn)  # type: ignore[assignment]
     return [_combination(value_axes, number) for number in numbers], set_count
+
+
+def check_names(root: Element, path: Path, document: Element) -> None:
+    """Raise FormatError, with its line, for the first parameter of a distribution that its scenario does not declare.
+
+    Args:
+        root: The document of the distribution.
+        path: Its file.
+        document: The document of the scenario.
+    """
+    distribution = root.find("ParameterValueDistribution")
+    if distribution is None:
+        return
+    values = AttributeReader(str(path))
+    declared = list(declarations(document))
+    for element in distribution.iter():
+        for attribute in ("parameterName", "parameterRef"):
+            name = element.get(attribute, "").removeprefix("$")
+            if name and name not in declared:
+                raise values.error(element, undeclared(name, declared, "its scenario"))
 
 
 def _combination(value_axes: Sequence[Sequence[Mapping[str, str]]], number: int) -> dict[str, str]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
 from xml.etree.ElementTree import Element
@@ -171,19 +172,36 @@ class Scope:
             try:
                 return self.value(reference[1])
             except KeyError:
-                raise error_at(element, f"{name}: parameter ${reference[1]} is not declared") from None
+                raise error_at(element, f"{name}: {self._unknown(reference[1])}") from None
         expression = _EXPRESSION.fullmatch(stripped)
         if expression is None:
             if stripped.startswith("$"):
                 raise error_at(element, f"{name}: '{raw[:60]}' is neither $parameter nor ${{expression}}")
             return raw
+
+        def lookup(parameter: str) -> str:
+            try:
+                return self.value(parameter)
+            except KeyError:
+                raise ConfigError(f"expression '{expression[1].strip()[:80]}': {self._unknown(parameter)}") from None
+
         try:
-            return text_of(evaluate(expression[1], self.value))
+            return text_of(evaluate(expression[1], lookup))
         except ConfigError as error:
             joined = self._joined_text(expression[1]) if name == "name" or name.endswith("Ref") else None
             if joined is None:
                 raise error_at(element, f"{name}: {error}") from None
             return joined
+
+    def names(self) -> list[str]:
+        """Return the names of all parameters that can be used here."""
+        return [*self.declarations, *(self.parent.names() if self.parent is not None else ())]
+
+    def _unknown(self, name: str) -> str:
+        """Return the message for a parameter that is not declared, with the names closest to it."""
+        suggestions = ", ".join(f"${match}" for match in get_close_matches(name, self.names(), n=3, cutoff=0.0))
+        hint = f"; closest: {suggestions}" if suggestions else ", and no other is"
+        return f"parameter ${name[:60]} is not declared{hint}"
 
     def _joined_text(self, expression: str) -> str | None:
         """Return the texts and parameters that + joins, as some tools name elements; None if it is no such text."""
@@ -248,21 +266,24 @@ def resolve(
             does not exist.
         ConstraintError: A parameter has a value that its declaration excludes.
     """
-    declarations = _declarations(root)
+    declared = declarations(root)
     for name in assigned or {}:
-        if name not in declarations:
-            names = ", ".join(declarations) or "none"
-            raise FormatError(
-                f"{file_path}: it declares no parameter '{name[:60]}' that could be set; declared: {names}"
-            )
-    scope = Scope(declarations, assigned or {})
+        if name not in declared:
+            raise FormatError(f"{file_path}: {undeclared(name, declared, 'it')}")
+    scope = Scope(declared, assigned or {})
     scope.check()
     resolver = _Resolver(_Catalogues(root, file_path, scope))
     resolved = resolver.copy(root, scope, declare=False)
-    return resolved, {name: scope.value(name) for name in declarations}
+    return resolved, {name: scope.value(name) for name in declared}
 
 
-def _declarations(element: Element) -> dict[str, Element]:
+def undeclared(name: str, declared: Iterable[str], owner: str) -> str:
+    """Return the message that a document, which `owner` names, does not declare a parameter that is to be set."""
+    return f"{owner} declares no parameter '{name[:60]}' that could be set; declared: {', '.join(declared) or 'none'}"
+
+
+def declarations(element: Element) -> dict[str, Element]:
+    """Return the declarations of parameters of an element, by name."""
     return {item.get("name", "").removeprefix("$"): item for item in element.iterfind("ParameterDeclarations/*")}
 
 
@@ -279,7 +300,7 @@ class _Resolver:
         if self.count > MAX_ELEMENTS:
             raise error_at(element, f"the document has more than {MAX_ELEMENTS} elements with its catalogues")
         if declare and element.find("ParameterDeclarations") is not None:
-            scope = Scope(_declarations(element), {}, scope)
+            scope = Scope(declarations(element), {}, scope)
             scope.check()
         attributes = {name: scope.text(element, name, value) for name, value in element.items()}
         result = LineElement(element.tag, attributes, getattr(element, "line", 0), getattr(element, "source", ""))
@@ -303,11 +324,11 @@ class _Resolver:
             item.get("parameterRef", ""): item.get("value", "")
             for item in copied.iterfind("ParameterAssignments/ParameterAssignment")
         }
-        declarations = _declarations(entry)
+        declared = declarations(entry)
         for name in assigned:
-            if name not in declarations:
+            if name not in declared:
                 raise error_at(reference, f"catalogue entry '{copied.get('entryName')}' has no parameter '{name[:60]}'")
-        inner = Scope(declarations, assigned, scope)
+        inner = Scope(declared, assigned, scope)
         inner.check()
         return self.copy(entry, inner, declare=False, depth=depth + 1)
 

@@ -35,8 +35,9 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
+from ssad.core.wording import counted
 from ssad.interchange.ego_start import start_parameters
-from ssad.interchange.openscenario_distributions import parameter_sets, scenario_file
+from ssad.interchange.openscenario_distributions import check_names, parameter_sets, scenario_file
 from ssad.interchange.openscenario_document import AttributeReader, ConstraintError, read_document, resolve
 from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_maps import DocumentMap, find_map
@@ -58,6 +59,7 @@ WAY: Final = 200.0  # m, shortest path along its lane of an agent without a rout
 LONGEST_WAY: Final = 3000.0  # m
 DEFAULT_TIME: Final = 60.0  # s of a scenario that states no time
 FAR_OFF: Final = 5.0  # m from the ego's route of a point that it does not pass
+MAX_MINOR: Final = 3  # minor version of the latest OpenSCENARIO XML that is known
 MAX_EGO_LONGITUDINAL: Final = parameter_box(CUSTOM)["ego_longitudinal"].high  # m
 
 
@@ -134,6 +136,8 @@ def read_openscenario_set(
     sets, total = parameter_sets(root, path, count=count)
     source = scenario_file(root, path) or path
     document = root if source is path else read_document(source)
+    check_names(root, path, document)
+    _note_newer_version(document, report)
     scenarios: list[Scenario] = []
     maps: dict[str, DocumentMap] = {}
     excluded = 0
@@ -165,6 +169,16 @@ def read_openscenario_set(
     if not scenarios:
         raise FormatError(f"{path}: all {len(sets)} sets of values are excluded by constraints of parameters")
     return ImportedSet(tuple(scenarios), report)
+
+
+def _note_newer_version(document: Element, report: ImportReport) -> None:
+    """Note a minor version beyond `MAX_MINOR`: elements that only it has are not known here."""
+    header = document.find("FileHeader")
+    minor = "" if header is None else header.get("revMinor", "").strip()
+    if minor.isdecimal() and int(minor) > MAX_MINOR:
+        report.note(
+            f"version 1.{minor[:9]} is newer than 1.{MAX_MINOR}, the latest one known: the file is read as that"
+        )
 
 
 class _Reader:
@@ -593,7 +607,7 @@ class _Reader:
                 raise self.values.error("Property", "ssad.signals_until is not a number") from None
         plan = plan_of(self.graph, line, forced_states, end_time)
         if plan is None:
-            self.doubts[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1
+            self.doubts[f"the states of {counted(len(forced_states), 'signal')}, which no signal plan here gives"] += 1
         return plan or SignalPlan()
 
 

@@ -575,7 +575,11 @@ class StoryboardReader:
             return phase if phase.continuous else replace(phase, shape="step")
         shape, dimension, value = self._dynamics(dynamics)
         if dimension == "rate" and value == 0.0 and shape != "step":
-            self.triggers.doubt(dynamics, f"the speed of '{entity.name}' stays as it is: its rate is 0")
+            self.triggers.doubt(
+                dynamics,
+                f"a SpeedAction of '{entity.name}' has the rate 0, with which its target is never reached: "
+                "the speed stays as it is, and the action has no end",
+            )
             return None
         is_full = dimension == "rate" and shape == "linear" and value in entity.limits
         if phase.continuous or is_full:

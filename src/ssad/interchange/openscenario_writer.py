@@ -33,6 +33,7 @@ from ssad.core.types import (
     Pose,
     SignalState,
 )
+from ssad.core.wording import counted
 from ssad.simulators.carla.blueprints import BLUEPRINTS, CATEGORY
 from ssad.world.models import agent_model
 
@@ -200,7 +201,7 @@ class _Writer:
             )
         if unmapped_count:
             self.omissions.append(
-                f"{unmapped_count} signals that are forced are not in the map: other programs do not know them"
+                f"{counted(unmapped_count, 'forced signal')} outside the map, unknown to other programs"
             )
         if self.episode.signal_override and self.episode.override_until < self.until:
             self.omissions.append(f"signals are forced only until {self.episode.override_until:g} s: others keep them")

@@ -17,11 +17,10 @@ import numpy.typing as npt
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import F64, I32, AgentKind, Bool, EpisodeTrace, LaneType
+from ssad.core.types import F64, I32, MOVING, AgentKind, Bool, EpisodeTrace, LaneType
 from ssad.metrics.criticality import trace_boxes
 from ssad.metrics.driving import first_contact
 
-MOVING: Final = 0.5  # m/s; an agent that is slower stands
 AGAINST: Final = 2.0 * np.pi / 3.0  # rad between course and lane from which an agent drives against traffic
 WRONG_WAY_TIME: Final = 0.3  # s on the wrong side that count; at the contact itself any time does
 LIMIT_TOLERANCE: Final = 1.1  # factor up to which a limit counts as respected

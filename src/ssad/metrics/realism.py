@@ -1,8 +1,9 @@
-"""Realism of motion: the histogram score of the sim-agents challenge, and Wasserstein distances.
+"""Realism of motion: the histogram score of the sim-agents challenge, Wasserstein distances, published limits.
 
 The challenge scores simulated agents against the log of the same agents. Generated scenarios have no log, so a motion
-is scored under histograms of a named reference, pooled over its agents and steps. Bins, weights and pseudo-count are
-the challenge's.
+is scored under histograms of SSAD's own traffic (`traffic_reference`), pooled over its agents and steps. Bins, weights
+and pseudo-count are the challenge's. A second reference needs no simulation: the highest values that are published of
+ordinary human driving (`published_limits`).
 
 Source: Montali et al., The Waymo Open Sim Agents Challenge, 2023, with the configuration of 2025.
 """
@@ -12,16 +13,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from ssad.core import safeio
+from ssad.core.errors import FormatError
 from ssad.core.geometry import obb_distance
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import F64, EpisodeTrace
+from ssad.core.types import F64, Bool, EpisodeTrace
 from ssad.metrics.criticality import time_to_collision, trace_boxes
+from ssad.metrics.human_driving import spread
 
 PSEUDO_COUNT: Final = 0.1
+REFERENCE: Final = Path(__file__).with_name("traffic_reference.json")
+QUANTILES: Final = 500  # of each feature that the reference keeps
+JERK_WINDOW: Final = 0.5  # s over which accelerations are averaged before their difference is taken
 
 
 @dataclass(frozen=True)
@@ -98,9 +107,103 @@ def motion_features(trace: EpisodeTrace, agent: int, road_edge: F64) -> dict[str
     }
 
 
+@dataclass(frozen=True)
+class PublishedLimits:
+    """Highest published values of ordinary human driving.
+
+    Attributes:
+        acceleration: Acceleration from rest, m/s^2.
+        deceleration: Largest deceleration of a routine stop, m/s^2.
+        lateral: Acceleration to the side in turns, m/s^2.
+        jerk: Jerk of a careful and competent driver, m/s^3.
+    """
+
+    acceleration: float
+    deceleration: float
+    lateral: float
+    jerk: float
+
+
+@cache
+def published_limits() -> PublishedLimits:
+    """Return the limits from `ssad.metrics.human_driving`, where each value has its source and certainty."""
+    return PublishedLimits(
+        acceleration=spread("acceleration from rest")[1],
+        deceleration=spread("largest deceleration of a routine stop")[1],
+        lateral=spread("lateral acceleration in turns")[1],
+        jerk=spread("jerk")[1],
+    )
+
+
+def within_published(trace: EpisodeTrace, agent: int) -> Bool:
+    """Return in which steps an agent drives within the published limits.
+
+    Args:
+        trace: The trace of the episode.
+        agent: The agent.
+
+    Returns:
+        [N - 1] for the N steps in which the agent is present, from its second on. Jerk is the difference between the
+        accelerations of two successive windows of 0.5 s.
+    """
+    limits, dt = published_limits(), float(trace.dt)
+    present = np.flatnonzero(trace.active[:, agent])
+    speed = trace.speed[present, agent].astype(np.float64)
+    acceleration = np.diff(speed) / dt
+    rate = np.asarray(wrap_angle(np.diff(trace.yaw[present, agent].astype(np.float64)))) / dt
+    within: Bool = (acceleration <= limits.acceleration) & (acceleration >= -limits.deceleration)
+    within &= np.abs(0.5 * (speed[1:] + speed[:-1]) * rate) <= limits.lateral
+    window = max(1, round(JERK_WINDOW / dt))
+    if len(speed) > 2 * window:
+        change = speed[2 * window :] - 2.0 * speed[window:-window] + speed[: -2 * window]
+        within[2 * window - 1 :] &= np.abs(change) / (window * dt) ** 2 <= limits.jerk
+    return within
+
+
 def pool_motions(motions: Sequence[Mapping[str, F64]]) -> dict[str, F64]:
     """Return the values of several motions together, by feature."""
     return {name: np.concatenate([motion[name] for motion in motions] or [np.zeros(0)]) for name in FEATURES}
+
+
+def reference_data(motions: Sequence[Mapping[str, F64]], **about: object) -> dict[str, object]:
+    """Return the content of a reference file.
+
+    Args:
+        motions: Features of the motions of ordinary traffic.
+        **about: Origin of the motions.
+    """
+    values: dict[str, object] = {}
+    for name, samples in pool_motions(motions).items():
+        if FEATURES[name].bins == 2:
+            values[name] = {"count": len(samples), "true": int(samples.sum())}
+        else:
+            shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+            values[name] = np.round(np.quantile(samples, shares), 4).tolist()
+    return {"about": {**about, "motions": len(motions)}, "values": values}
+
+
+def traffic_reference(path: Path = REFERENCE) -> dict[str, F64]:
+    """Return the features of ordinary traffic: those of SSAD's population of drivers, unless a file is given.
+
+    Args:
+        path: File of `python -m benchmarks.traffic_reference`.
+
+    Returns:
+        Feature -> values, as for `realism` and `wasserstein`; of continuous features 500 quantiles.
+
+    Raises:
+        FormatError: The file is none.
+    """
+    data = safeio.read_json(path)
+    values = data.get("values") if isinstance(data, dict) else None
+    if not isinstance(values, dict) or set(values) != set(FEATURES):
+        raise FormatError(f"{path}: no reference of traffic; make it with python -m benchmarks.traffic_reference")
+    return {
+        name: np.asarray(
+            np.arange(entry["count"]) < entry["true"] if isinstance(entry, dict) else entry, dtype=np.float64
+        )
+        for name, entry in values.items()
+    }
 
 
 def histogram(values: F64, feature: Feature) -> F64:

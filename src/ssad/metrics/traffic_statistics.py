@@ -211,17 +211,26 @@ def visits(pose: F64, length: F64, scene: Ints, present: Bool, *, pause: int = 5
     return Visits(stay[:, 0], stay[:, 1], stay[:, 2], stay[:, 3], heading[order])
 
 
-def post_encroachment_times(stays: Visits, time_step: float, *, longest: float = 10.0) -> F64:
+def post_encroachment_times(
+    stays: Visits, time_step: float, *, longest: float = 10.0, apart: Bool | None = None
+) -> F64:
     """Return the post-encroachment times of vehicles whose paths cross, s: one for each two vehicles, the least.
 
-    It is the time from when one leaves a place until another, on a crossing path, comes there. Times above `longest`
-    are left out.
+    It is the time from when one leaves a place until another, on a crossing path, comes there.
+
+    Args:
+        stays: Stays of all vehicles.
+        time_step: s.
+        longest: Times above it, s, are left out.
+        apart: [N] Only pairs of which exactly one is marked count, such as walkers among vehicles; None: all pairs.
 
     Source: Allen, B. L., Shin, B. T. and Cooper, P. J. (1978), Transportation Research Record 667.
     """
     next_same = stays.place[1:] == stays.place[:-1]
     crossing = np.abs(np.asarray(wrap_angle(stays.yaw[1:] - stays.yaw[:-1]))) > CROSSES
     other = stays.vehicle[1:] != stays.vehicle[:-1]
+    if apart is not None:
+        other &= apart[stays.vehicle[1:]] != apart[stays.vehicle[:-1]]
     time = np.maximum(stays.first[1:] - stays.last[:-1], 0) * time_step
     rows = np.flatnonzero(next_same & crossing & other & (time <= longest))
     shortest_times: dict[tuple[int, int], float] = {}

@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.wording import counted
 from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
 from ssad.recorders.parts import PartsFolder
@@ -76,7 +77,7 @@ class TargetRecording:
             raise ConfigError("name a town to record, and drive or orbit")
         for town, count in self.images:
             if count < 1:
-                raise ConfigError(f"{town}: {count} pictures; ask for one or more")
+                raise ConfigError(f"{town}: {counted(count, 'picture')}; ask for one or more")
             if sum(name == town for name, _ in self.images) > 1:
                 raise ConfigError(f"{town} is named twice; name each town once")
         if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:

@@ -85,7 +85,8 @@ def _counts(table: Table) -> list[str]:
     if not cells:
         return []
     clusters = [cell.clusters for cell in cells if cell.clusters]
-    cluster_text = f" in {_range(clusters)} clusters" if clusters else ""
+    noun = "cluster" if clusters and max(clusters) == 1 else "clusters"
+    cluster_text = f" in {_range(clusters)} {noun}" if clusters else ""
     return [f"n = {_range([cell.n for cell in cells])}{cluster_text}."]
 
 

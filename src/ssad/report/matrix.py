@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, TypeGuard
 
+from ssad.core.wording import counted
 from ssad.metrics import METRICS
 from ssad.report.load import Run
 from ssad.report.records import SWEEP, Line, result_cell
@@ -166,13 +167,13 @@ def _count_note(table_rows: Iterable[TableRow], mean_note: str) -> str:
     fewest, most = min(table_cell.n for table_cell in filled), max(table_cell.n for table_cell in filled)
     clusters = max(table_cell.clusters for table_cell in filled)
     count = str(fewest) if fewest == most else f"{fewest} to {most}"
-    cluster_text = f" in {clusters} cluster{'s' if clusters > 1 else ''}" if most > 1 else ""
+    cluster_text = f" in {counted(clusters, 'cluster')}" if most > 1 else ""
     noun = "case" if most == 1 else "cases"
     return f"{mean_note or 'Each number is of one point of the grid.'} n = {count} {noun} behind it{cluster_text}."
 
 
 def _mean_note(records: Sequence[Line], others: Sequence[str]) -> str:
-    listed = ", ".join(f"{name} ({len(_values(records, name))} values)" for name in others)
+    listed = ", ".join(f"{name} ({counted(len(_values(records, name)), 'value')})" for name in others)
     return f"Each number is the mean over {listed}."
 
 

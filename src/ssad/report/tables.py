@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from ssad.core import safeio
 from ssad.core.folders import path_inside
+from ssad.core.wording import counted
 from ssad.metrics import Estimate
 
 Record = TypeVar("Record")
@@ -75,7 +76,7 @@ class TableCell:
         """`n = 40 in 4 clusters, 2 failed`; n are the cases that ran."""
         if not self.n and not self.failed:
             return ""
-        cluster_text = f" in {self.clusters} clusters" if self.clusters not in (0, self.n) else ""
+        cluster_text = f" in {counted(self.clusters, 'cluster')}" if self.clusters not in (0, self.n) else ""
         return f"n = {self.n}{cluster_text}" + (f", {self.failed} failed" if self.failed else "")
 
     @property

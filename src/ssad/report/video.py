@@ -13,7 +13,7 @@ from PIL import Image
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import atomic_path
-from ssad.core.top_view import Frame, TopView, TopViewScene
+from ssad.core.top_view import Frame, TopView, TopViewScene, lit_turn_signals
 from ssad.core.types import EpisodeTrace
 
 CODECS = ("vp09", "mp4v")  # VP9, which browsers play; where it is missing MPEG-4 part 2, which most players know
@@ -33,6 +33,8 @@ def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (96
             captions.append(trace.end.replace("_", " "))
         signals = [(x, y, int(state)) for (x, y), state in zip(signal_positions, trace.signal[step], strict=True)]
         steps_since_contact = None if first_hit is None or step < first_hit else step - int(first_hit)
+        shows_signals = trace.turn_signal.size > 0
+        lit_signals = lit_turn_signals(trace.turn_signal[step], step * trace.dt) if shows_signals else None
         trail = pose[max(step - 30, 0) : step + 1, 0, :2]
         yield top_view.draw(
             TopViewScene(
@@ -45,6 +47,7 @@ def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (96
                 signals,
                 hit=steps_since_contact,
                 words=captions,
+                turn_signal=lit_signals,
             )
         )
 

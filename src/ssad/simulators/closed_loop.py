@@ -369,13 +369,27 @@ def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
 
 def grades_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> list[Grade]:
     """Grade the collisions of drives by the drivers that could have avoided them; all are replayed side by side."""
-    from ssad.drivers import make_system
     from ssad.drivers.careful.grade import grade_collisions
 
-    policies = [
-        make_system(name)
-        for name in dict.fromkeys(policy_name for episode, _ in drives for policy_name in policies_of(episode.scenario))
-    ]
-    sensors = onboard_sensors(policies, device)
-    graded_drives = [(episode, cached_town(episode.town), trace) for episode, trace in drives]
-    return grade_collisions(graded_drives, device=device, policies=make_system, sensors=sensors)
+    return grade_collisions(_graded_drives(drives), **_grading_options(drives, device))
+
+
+def avoiders_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> list[Mapping[str, bool]]:
+    """Return which careful drivers avoid the collisions of drives, by short name; `grades_of` without the limit."""
+    from ssad.drivers.careful.grade import careful_drivers_avoid
+
+    return careful_drivers_avoid(_graded_drives(drives), **_grading_options(drives, device))
+
+
+def _graded_drives(drives: Sequence[tuple[Episode, EpisodeTrace]]) -> list[tuple[Episode, LaneGraph, EpisodeTrace]]:
+    """Return drives with their towns."""
+    return [(episode, cached_town(episode.town), trace) for episode, trace in drives]
+
+
+def _grading_options(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> dict[str, Any]:
+    """Return where a grading computes, and who drives the others."""
+    from ssad.drivers import make_system
+
+    names = dict.fromkeys(name for episode, _ in drives for name in policies_of(episode.scenario))
+    sensors = onboard_sensors([make_system(name) for name in names], device)
+    return {"device": device, "policies": make_system, "sensors": sensors}

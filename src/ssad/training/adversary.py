@@ -18,7 +18,9 @@ from ssad.core.seeding import digest
 from ssad.core.types import Scenario
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic.generate import Trials
-from ssad.training.driver import VALIDATION_SEED, draw_episodes, find_scenarios
+from ssad.simulators.proofs import prove_collisions
+from ssad.training.driver import VALIDATION_SEED, draw_episodes, natural_scenarios
+from ssad.training.feasibility import FeasibleRegion
 from ssad.training.recipe import command_line_changes
 from ssad.training.reinforcement import (
     POLICY_RECIPES,
@@ -32,57 +34,49 @@ from ssad.training.reinforcement import (
 from ssad.world.policy import Policy, PolicyDriver
 from ssad.world.selection import FreaSelection
 
-_SETTING: dict[str, Any] = {
-    "observation": "adversary",
-    "action": "adversary",
-    "reward": "adversary",
-    "draws": 6,
-    "gamma": 0.98,
+_SETTING: dict[str, Any] = {"draws": 6, "gamma": 0.98}
+_PROVING: dict[str, Any] = {
+    **_SETTING,
+    "observation": "adversary-on-road",
+    "action": "pedals",
+    "reward": "proving",
+}
+_PAPER: dict[str, Any] = {**_SETTING, "observation": "adversary", "action": "adversary", "reward": "adversary"}
+_PPO: dict[str, Any] = {"lr": 3e-4, "noise": 0.6, "entropy": 0.002}
+_LONG: dict[str, Any] = {
+    "lr": 5e-4,
+    "noise": 0.4,
+    "entropy": 0.002,
+    "rollout": 64,
+    "steps": 2_000_000,
+    "validate": 250_000,
 }
 ADVERSARIES = {
-    "adv-ppo": replace(
-        POLICY_RECIPES["ppo"],
-        steps=200_000,
-        **_SETTING,
-        lr=3e-4,
-        noise=0.6,
-        entropy=0.002,
-        validate=50_000,
-    )
-}
-ADVERSARIES |= {
-    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=3),
-    "adv-sac": replace(
-        POLICY_RECIPES["sac"],
-        steps=100_000,
-        **_SETTING,
-        lr=3e-4,
-        batch=256,
-        validate=25_000,
-    ),
-    "adv-ddpg": replace(
-        POLICY_RECIPES["td3"],
-        algorithm="ddpg",
-        steps=100_000,
-        **_SETTING,
-        batch=256,
-        validate=25_000,
-    ),
+    "adv-ppo": replace(POLICY_RECIPES["ppo"], **_PROVING, **_LONG),
+    "adv-ppo-paper": replace(POLICY_RECIPES["ppo"], steps=200_000, **_PAPER, **_PPO, validate=50_000),
+    "frea": replace(POLICY_RECIPES["ppo"], **_PROVING | {"reward": "lawful"}, **_LONG),
+    "adv-sac": replace(POLICY_RECIPES["sac"], steps=100_000, **_PROVING, lr=3e-4, batch=256, validate=25_000),
+    "adv-ddpg": replace(POLICY_RECIPES["td3"], algorithm="ddpg", steps=200_000, **_PROVING, batch=256, validate=50_000),
     "adv-dqn": replace(
         POLICY_RECIPES["sac"],
         algorithm="dqn",
         steps=100_000,
-        **_SETTING,
+        **_PROVING,
         lr=5e-4,
         batch=256,
         noise=0.05,
         validate=25_000,
     ),
 }
-"""How adversaries are trained."""
-SCENARIOS = {"frea": ("training-lanes",)}
+"""How adversaries are trained: for proven collisions, but for `adv-ppo-paper`, which is the paper's Adv.PPO."""
+SCENARIOS = {name: ("training", "training-lanes") for name in ADVERSARIES if name != "adv-ppo-paper"}
 """What they learn in unless told otherwise, where that is not the set `training`."""
-REWARDS = ("adversary", "colliding", "feasible")
+ROAD_COSTS = {"adv-ppo-paper": 0.0}
+"""What a step off the road costs unless told otherwise, where that is not `ROAD_COST`."""
+ROAD_COST = 0.5
+WITH_REGION = ("frea",)
+"""Adversaries that have the feasible region as a critic."""
+REWARDS = ("adversary", "colliding", "feasible", "lawful", "proving")
 """What they may learn from; see `ssad.training.adversary_env`."""
 
 
@@ -98,9 +92,13 @@ class AdversaryPlan:
             `training`).
         test: Scenarios of the final test.
         literal: Use equation 6 as printed for the reward.
-        off_road: Cost of each step of an adversary off the road (the paper and FREA: 0).
+        off_road: Cost of each step of an adversary off the road; None: the default of the algorithm (`ROAD_COSTS`;
+            the paper and FREA: 0).
         changes: Changed values of the recipe.
         seconds: Time limit, s; None: none.
+        region: Weights of the feasible region that is the second critic of PPO; None: the shipped one for the
+            algorithms of `WITH_REGION`, none for others.
+        device: Device of the networks.
     """
 
     algorithm: str
@@ -109,22 +107,19 @@ class AdversaryPlan:
     scenarios: tuple[str, ...] = ()
     test: tuple[str, ...] = ("natural",)
     literal: bool = False
-    off_road: float = 0.5
+    off_road: float | None = None
     changes: tuple[tuple[str, Any], ...] = ()
     seconds: float | None = None
+    region: Path | None = None
+    device: str = "cpu"
 
     def learned_in(self) -> tuple[str, ...]:
         """Return the sets and files of the training."""
         return self.scenarios or SCENARIOS.get(self.algorithm, ("training",))
 
-
-def natural_scenarios(references: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
-    """The scenarios of some sets that have background traffic, and the lane graphs of their towns."""
-    scenarios, graphs = find_scenarios(references)
-    with_traffic = [
-        scenario for scenario in scenarios if scenario.type == "NaturalJunction" or scenario.traffic is not None
-    ]
-    return with_traffic, {name: graphs[name] for name in sorted({scenario.town for scenario in with_traffic})}
+    def road_cost(self) -> float:
+        """Return what a step off the road costs."""
+        return ROAD_COSTS.get(self.algorithm, ROAD_COST) if self.off_road is None else self.off_road
 
 
 def measure_adversary(
@@ -141,8 +136,9 @@ def measure_adversary(
         count: Simultaneous adversaries.
 
     Returns:
-        Shares of the episodes: CR, the ego collides; valid, it collides with an adversary that stayed on the road and
-        touched no other agent; off, an adversary left the road; others, an adversary touched another agent.
+        Shares of the episodes: proven, the ego is in a proven collision (`ssad.metrics.proven_collisions`); CR, it
+        collides; valid, it collides with an adversary that stayed on its side of the road and touched no other agent;
+        off, an adversary left its side of the road; others, an adversary touched another agent.
     """
     trials = Trials(lambda: make_system(ego), policies=make_system)
     drivers = {} if driver is None else {FreaSelection(count=count): driver}
@@ -151,7 +147,9 @@ def measure_adversary(
         for episode in draw_episodes(scenarios, graphs, draws=1, seed=seed)
     ]
     outcomes = trials.run(proposals)
+    collisions = [(base, outcome) for (base, _), outcome in zip(proposals, outcomes, strict=True)]
     shares = {
+        "proven": prove_collisions(collisions, trials),
         "CR": [outcome.trace is not None and outcome.trace.end == "collision" for outcome in outcomes],
         "valid": [outcome.is_valid for outcome in outcomes],
         "off": [outcome.off_road for outcome in outcomes],
@@ -179,6 +177,7 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         raise unknown_name("reward of an adversary", learning.reward, REWARDS)
     if plan.literal and learning.reward != "adversary":
         raise ConfigError(f"equation 6 as it is printed is no form of the reward {learning.reward}; leave one out")
+    region = _region(plan, learning)
     ego = make_system(plan.ego)
     safeio.make_folder(plan.out)
     torch.set_num_threads(1)
@@ -189,17 +188,22 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         )
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
     report(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}; ego: {plan.ego}")
-    environment = _environment(learning, plan, episodes, graphs, ego)
-    model = make_model(learning, environment)
+    environment = _environment(learning, plan, episodes, graphs, ego=ego, region=region)
+    model = make_model(learning, environment, device=plan.device, buffer=_buffer(environment, region))
     validation_setup = {"ego": plan.ego, "scenarios": scenarios, "graphs": graphs, "seed": VALIDATION_SEED}
 
     def validate(policy: Policy) -> dict[str, float]:
         metrics = measure_adversary(PolicyDriver(policy, name="candidate"), **validation_setup)  # type: ignore[arg-type]
-        # CR says nothing about avoidable collisions: without a score the last weights are kept
-        return metrics | ({} if learning.reward == "feasible" else {"score": metrics["valid"]})
+        # Proven collisions are few, so the valid ones decide between policies with as many of them.
+        return metrics | {"score": metrics["proven"] + 0.1 * metrics["valid"]}
 
     fingerprint = digest(
-        "adversary training", plan.ego, plan.literal, plan.off_road, *(episode.key for episode in episodes)
+        "adversary training",
+        plan.ego,
+        plan.literal,
+        plan.road_cost(),
+        "" if region is None else region.hash,
+        *(episode.key for episode in episodes),
     )[:16]
     state = train_policy(
         model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, metadata=fingerprint
@@ -216,11 +220,40 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         data=f"{description}; ego {plan.ego}",
         command=command_of(plan),
         test=measure_all(plan),
-        metadata={"ego": plan.ego},
+        metadata={"ego": plan.ego} | ({} if region is None else {"region": region.hash[:12]}),
     )
 
 
-def _environment(learning: PolicyRecipe, plan: AdversaryPlan, episodes: Any, graphs: Any, ego: Driver) -> Any:
+def _region(plan: AdversaryPlan, learning: PolicyRecipe) -> FeasibleRegion | None:
+    """Return the feasible region of a plan. ConfigError where no PPO learns from it."""
+    if plan.region is None and plan.algorithm not in WITH_REGION:
+        return None
+    if learning.algorithm != "ppo":
+        raise ConfigError(
+            f"a feasible region is a critic of PPO, and {plan.algorithm} learns by {learning.algorithm}: "
+            "leave out --region"
+        )
+    return FeasibleRegion.load(plan.region)
+
+
+def _buffer(environment: Any, region: FeasibleRegion | None) -> tuple[Any, dict[str, Any]] | None:
+    """Return the class of the rollout buffer and its arguments; None: that of stable-baselines3."""
+    if region is None:
+        return None
+    from ssad.training.feasible_ppo import FeasibleBuffer
+
+    return FeasibleBuffer, {"environment": environment}
+
+
+def _environment(
+    learning: PolicyRecipe,
+    plan: AdversaryPlan,
+    episodes: Any,
+    graphs: Any,
+    *,
+    ego: Driver,
+    region: FeasibleRegion | None,
+) -> Any:
     from ssad.training.reinforcement import import_sb3
 
     import_sb3()
@@ -234,9 +267,11 @@ def _environment(learning: PolicyRecipe, plan: AdversaryPlan, episodes: Any, gra
         seed=learning.seed,
         reward=learning.reward,
         literal=plan.literal,
-        off_road=plan.off_road,
+        off_road=plan.road_cost(),
         scale=learning.reward_scale,
         action=learning.action,
+        observation=learning.observation,
+        region=region,
     )
 
 
@@ -262,5 +297,6 @@ def command_of(plan: AdversaryPlan) -> str:
     arguments += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != defaults.scenarios else []
     arguments += ["--test", ",".join(plan.test)] if plan.test != defaults.test else []
     arguments += ["--literal"] if plan.literal else []
-    arguments += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != defaults.off_road else []
+    arguments += ["--off-road", f"{plan.off_road:g}"] if plan.off_road is not None else []
+    arguments += ["--region", str(plan.region)] if plan.region is not None else []
     return shlex.join([*arguments, *command_line_changes(plan.changes)])

@@ -13,13 +13,27 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ssad.core.driving import Driver, WorldState
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import F64, I32, Bool, Controller, End, Episode
+from ssad.core.types import DEFAULT_FRICTION, F32, F64, I32, MOVING, Bool, Controller, End, Episode
 from ssad.drivers import make_system
+from ssad.metrics.proven_collisions import LIMIT_TOLERANCE, WRONG_WAY_TIME
+from ssad.training.feasibility import FeasibleRegion, region_states
 from ssad.training.hindsight import Hindsight
 from ssad.world.actions import ACTIONS, WIDTHS, to_controls
+from ssad.world.models import lateral_grip
 from ssad.world.rewards import adversary as adversary_reward
-from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible, hit_ego
+from ssad.world.rewards import (
+    colliding,
+    cost_of,
+    distance_to_goal,
+    drives_against,
+    feasible,
+    hit_ego,
+    hit_others,
+    lawful,
+    proving,
+)
 from ssad.world.rollout import Loop
 from ssad.world.sb3 import SharedAttributes
 from ssad.world.selection import FreaSelection, Note
@@ -27,6 +41,50 @@ from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 
 _ADVERSARY = 1_000  # index of the adversaries' driver, beyond those of the loop
+
+
+class Conduct:
+    """Whether the adversary of each scene has kept to what a proven collision asks of it since it was selected.
+
+    It must not drive against traffic for 0.3 s, nor now; not leave the road; not turn harder than its tyres allow; and
+    touch nobody but the ego. See `ssad.metrics.proven_collisions`.
+    """
+
+    def __init__(self, scenes: int, *, dt: float) -> None:
+        self._dt = dt
+        self._wrong_steps = np.zeros(scenes, np.int64)
+        self._is_flawed = np.zeros(scenes, bool)
+        self._was_on_road = np.zeros(scenes, bool)
+
+    def begin(self, scenes: npt.ArrayLike) -> None:
+        """Forget what was, in scenes with another adversary."""
+        index = np.asarray(scenes)
+        self._wrong_steps[index], self._is_flawed[index], self._was_on_road[index] = 0, False, False
+
+    def record(self, state: WorldState, agents: I32, alignment: F32, previous_yaw: F32) -> Bool:
+        """Record a step; return [N] whether the adversaries have kept to it until now.
+
+        Args:
+            state: After the step.
+            agents: [N, 2] scene and agent of the adversaries.
+            alignment: [N] first number of the sensor `road`.
+            previous_yaw: [N] heading before the step, rad.
+        """
+        scene, agent = agents.T
+        is_against = drives_against(state, agents, alignment)
+        self._wrong_steps[scene] = np.where(is_against, self._wrong_steps[scene] + 1, 0)
+        on_road = state.lane[scene, agent] >= 0
+        turn = np.abs(np.asarray(wrap_angle(state.pose[scene, agent, 2] - previous_yaw)))
+        lateral = np.abs(state.speed[scene, agent]) * turn / self._dt
+        self._is_flawed[scene] |= (
+            (self._wrong_steps[scene] >= round(WRONG_WAY_TIME / self._dt))
+            | (self._was_on_road[scene] & ~on_road)
+            | (lateral > LIMIT_TOLERANCE * lateral_grip(DEFAULT_FRICTION))
+            | hit_others(state, agents)
+        )
+        self._was_on_road[scene] |= on_road
+        kept: Bool = ~self._is_flawed[scene] & ~is_against
+        return kept
 
 
 class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
@@ -42,11 +100,18 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         num_envs: Number of scenes.
         ego: Driver of the egos.
         seed: Seed of the draws of episodes.
-        reward: `adversary`, `colliding` (equation 5) or `feasible` of `ssad.world.rewards`.
+        reward: `adversary`, `colliding` (equation 5), `feasible`, `lawful` or `proving` of `ssad.world.rewards`.
         literal: Equation 6 as it is printed, see `ssad.world.rewards.adversary`.
         off_road: Cost of a step off the road, likewise.
+        against: Cost of a step against traffic; of the rewards `lawful` and `proving`.
         scale: Factor on the reward.
         action: As in `ssad.world.actions.to_controls`.
+        observation: Sensor that the adversaries look at.
+        region: Feasible region whose values `region_values` holds; None: none.
+
+    Attributes:
+        region_values: [2, num_envs] value of the region before and after the last step; 0 without an adversary.
+        is_driven: [num_envs] whether there was an adversary in the last step.
     """
 
     def __init__(
@@ -60,11 +125,14 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         reward: str = "adversary",
         literal: bool = False,
         off_road: float = 0.0,
+        against: float = 1.0,
         scale: float = 0.05,
         action: str = "adversary",
+        observation: str = "adversary",
+        region: FeasibleRegion | None = None,
     ) -> None:
         bound = np.float32(1.0e4)
-        space = gym.spaces.Box(-bound, bound, (WIDTHS["adversary"],), np.float32)
+        space = gym.spaces.Box(-bound, bound, (WIDTHS[observation],), np.float32)
         self.render_mode = None
         super().__init__(num_envs, space, gym.spaces.Box(-1.0, 1.0, (ACTIONS[action],), np.float32))
         self.world = World(episodes, graphs, assign=np.arange(num_envs) % len(episodes))
@@ -74,8 +142,15 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             "adversary": partial(adversary_reward, literal=literal, off_road=off_road),
             "colliding": colliding,
             "feasible": partial(self._feasible, off_road=off_road),
+            "lawful": partial(self._lawful, off_road=off_road, against=against),
+            "proving": partial(self._proving, off_road=off_road, against=against),
         }[reward]
-        self._hindsight = Hindsight(num_envs, self.world.agents, dt=self.world.dt) if reward == "feasible" else None
+        is_judged = reward in ("feasible", "proving")
+        self._hindsight = Hindsight(num_envs, self.world.agents, dt=self.world.dt) if is_judged else None
+        self._conduct = Conduct(num_envs, dt=self.world.dt) if reward == "proving" else None
+        self._previous_yaw = np.zeros(0, np.float32)
+        self._observation, self._region = observation, region
+        self.region_values, self.is_driven = np.zeros((2, num_envs), np.float32), np.zeros(num_envs, bool)
         self._previous_cost = cost_of if reward == "colliding" else distance_to_goal
         self._scale, self._action = scale, action
         self._random = generator("adversary episodes", seed)
@@ -102,11 +177,17 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         world, adversary = self.world, self._adversaries.copy()
         active_scenes = np.flatnonzero(adversary >= 0)
         agents = np.stack([active_scenes, adversary[active_scenes]], 1).astype(np.int32)
-        before_step = self._previous_cost(world.state(), agents)
+        state = world.state()
+        before_step = self._previous_cost(state, agents)
+        self._previous_yaw = state.pose[active_scenes, adversary[active_scenes], 2].copy()
+        self.is_driven = adversary >= 0
+        self.region_values[:] = 0.0
+        self.region_values[0, active_scenes] = self._region_value(state, agents)
         controls = np.zeros((self.num_envs, world.agents, 4), np.float32)
         controls[active_scenes, adversary[active_scenes]] = to_controls(self._action, self._actions[active_scenes])
         self.loop.step(controls)
         state = world.state()
+        self.region_values[1, active_scenes] = self._region_value(state, agents)
         if self._hindsight is not None:
             self._hindsight.record(state)
         reward = np.zeros(self.num_envs)
@@ -151,6 +232,42 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             avoidable[avoidable] = self._hindsight.is_avoidable(state, agents[avoidable])
         return feasible(state, agents, previous_cost, avoidable, off_road=off_road)
 
+    def _lawful(self, state: WorldState, agents: I32, previous_cost: F64, *, off_road: float, against: float) -> F64:
+        """Return the reward `lawful`."""
+        alignment = self._alignment(agents)
+        return lawful(state, agents, previous_cost, alignment, off_road=off_road, against=against)
+
+    def _proving(self, state: WorldState, agents: I32, previous_cost: F64, *, off_road: float, against: float) -> F64:
+        """Return the reward `proving`, with hindsight for adversaries in contact with the ego."""
+        assert self._hindsight is not None
+        assert self._conduct is not None
+        alignment = self._alignment(agents)
+        proven = self._conduct.record(state, agents, alignment, self._previous_yaw)
+        proven &= hit_ego(state, agents) & (np.abs(state.speed[agents[:, 0], 0]) > MOVING)
+        if proven.any():
+            proven[proven] = self._hindsight.is_avoidable(state, agents[proven])
+        return proving(state, agents, previous_cost, alignment, proven, off_road=off_road, against=against)
+
+    def _alignment(self, agents: I32) -> F32:
+        """Return how well the road under adversaries [N, 2] fits their course, [N]; see the sensor `road`."""
+        alignment: F32 = SENSORS["road"](self.world, self._rows(agents))[agents[:, 0], 0]
+        return alignment
+
+    def _rows(self, agents: I32) -> I32:
+        """Return an agent of every scene [num_envs, 2], those of `agents` where there are any.
+
+        Sensors keep their buffers as long as they are asked for as many agents.
+        """
+        rows = np.stack([np.arange(self.num_envs), np.zeros(self.num_envs, np.int64)], 1).astype(np.int32)
+        rows[agents[:, 0], 1] = agents[:, 1]
+        return rows
+
+    def _region_value(self, state: WorldState, agents: I32) -> F32:
+        """Return the value [N] of the feasible region for the egos of adversaries; 0 without a region."""
+        if self._region is None or not len(agents):
+            return np.zeros(len(agents), np.float32)
+        return self._region.value(region_states(state, agents[:, 0], agents[:, 1]))
+
     def _draw(self, count: int) -> I32:
         return self._random.integers(len(self.world.episodes), size=count).astype(np.int32)
 
@@ -170,11 +287,13 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             self.world.take(is_taken & ~selected, None)
         if (selected & ~is_taken).any():
             self.world.take(selected & ~is_taken, Controller.EXTERNAL, policy=_ADVERSARY)
+            if self._conduct is not None:
+                self._conduct.begin(np.flatnonzero((selected & ~is_taken).any(1)))
         self._adversaries = adversary
 
     def _observe(self, agent_indices: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
-        """[num_envs, 24]; zeros where there is no adversary."""
+        """[num_envs, n]; zeros where there is no adversary."""
         # The sensor needs a valid agent in every row; rows without an adversary are zeroed below.
         agents = np.stack([np.arange(self.num_envs), np.maximum(agent_indices, 0)], 1).astype(np.int32)
-        rows = SENSORS["adversary"](self.world, agents)
+        rows = SENSORS[self._observation](self.world, agents)
         return np.where((agent_indices >= 0)[:, None], rows, 0.0).astype(np.float32)

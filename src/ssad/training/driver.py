@@ -79,6 +79,15 @@ def find_scenarios(references: Sequence[str]) -> tuple[list[Scenario], dict[str,
     return scenarios, {town: _town(town) for town in sorted({scenario.town for scenario in scenarios})}
 
 
+def natural_scenarios(references: Sequence[str]) -> tuple[list[Scenario], dict[str, LaneGraph]]:
+    """The scenarios of some sets that have background traffic, and the lane graphs of their towns."""
+    scenarios, graphs = find_scenarios(references)
+    with_traffic = [
+        scenario for scenario in scenarios if scenario.type == "NaturalJunction" or scenario.traffic is not None
+    ]
+    return with_traffic, {name: graphs[name] for name in sorted({scenario.town for scenario in with_traffic})}
+
+
 def draw_episodes(
     scenarios: Sequence[Scenario], graphs: Mapping[str, LaneGraph], *, draws: int, seed: int
 ) -> list[Episode]:

@@ -63,7 +63,7 @@ class PolicyRecipe:
 
     algorithm: Literal["ppo", "sac", "td3", "ddpg", "dqn"]
     steps: Whole
-    observation: Literal["safebench", "frea", "traffic", "adversary"] = "traffic"
+    observation: Literal["safebench", "frea", "traffic", "adversary", "adversary-on-road"] = "traffic"
     action: Literal["safebench", "frea", "pedals", "adversary"] = "pedals"
     reward: str = "driver"
     reward_scale: Above = 0.05
@@ -116,13 +116,16 @@ def import_sb3() -> Any:
     return stable_baselines3
 
 
-def make_model(recipe: PolicyRecipe, env: Any, *, device: str = "cpu") -> Any:
+def make_model(
+    recipe: PolicyRecipe, env: Any, *, device: str = "cpu", buffer: tuple[Any, dict[str, Any]] | None = None
+) -> Any:
     """Make a new stable-baselines3 model on a `VecEnv`.
 
     Args:
         recipe: The recipe.
         env: The vector environment.
         device: Device of the networks.
+        buffer: ppo: class of a rollout buffer that scales its advantages itself, and its arguments.
     """
     sb3 = import_sb3()
     initial_rate, final_rate = recipe.lr, recipe.lr / 20.0
@@ -140,6 +143,12 @@ def make_model(recipe: PolicyRecipe, env: Any, *, device: str = "cpu") -> Any:
     policy_options: dict[str, Any] = {"net_arch": list(recipe.hidden), "activation_fn": torch.nn.ReLU}
     if recipe.algorithm == "ppo":
         policy_options["log_std_init"] = math.log(recipe.noise)
+        if buffer is not None:
+            common_options |= {
+                "rollout_buffer_class": buffer[0],
+                "rollout_buffer_kwargs": buffer[1],
+                "normalize_advantage": False,
+            }
         return sb3.PPO(
             "MlpPolicy",
             env,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ssad.core.types import F32
 
-WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversary": 24}
+WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversary": 24, "adversary-on-road": 45}
 """Sensors that a policy can look at, and how many numbers they have."""
 ACTIONS: Mapping[str, int] = {"safebench": 2, "frea": 3, "pedals": 2, "adversary": 2}
 """Actions that a policy can take, and how many numbers they have; see `to_controls`."""

@@ -12,12 +12,14 @@ import warp as wp
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import TURN, LaneGraph, Marking, SignKind
-from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, Scripts, TurnRank, array_types
+from ssad.core.types import F32, I8, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
+from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, Scripts, TurnRank, Walkers, array_types
 from ssad.world.kernels.shared import BRIDGE
 from ssad.world.models import GRAVITY, agent_model, lateral_grip
 from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.scripts import ScriptTables
+from ssad.world.turn_signals import turn_sides
+from ssad.world.walkers import build_walkers, has_walkers
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
@@ -332,6 +334,7 @@ def _put_agent(  # noqa: PLR0917
         a["style"][e, i] = driver.time_gap, driver.standstill_gap, driver.acceleration, driver.deceleration
         a["manner"][e, i] = driver.pace, driver.jerk, driver.reaction_time, driver.estimation_error
         a["habit"][e, i] = driver.lane_offset, driver.errors, driver.key
+        a["courtesy"][e, i] = driver.politeness, driver.change_duration
     a["route"][e, i] = route
     a["track"][e, i] = track
 
@@ -347,6 +350,7 @@ class Bank:
         script_rows: Rows of phases and words of history that the widest episode needs; (0, 0): no agent is scripted.
         script_sizes: [E, 2] The same for each episode.
         tables: The same routes for the host.
+        turn: `TurnSignal` [R] of the turn at the next junction of each route point.
         agents: A, slots per scene.
         kind: [E, A] AgentKind of every slot.
         size: [E, A, 2] length and width, m.
@@ -354,6 +358,7 @@ class Bank:
         program: [E, S, 4] programmes of the town's signals, see `signal_programs`.
         forced: [E, S] forced signal states, -1: none.
         until: [E] time until which they are forced, s.
+        walkers: Walkers of natural traffic on the device; None: there are none.
     """
 
     episodes: EpisodeArrays
@@ -362,6 +367,7 @@ class Bank:
     script_rows: tuple[int, int]
     script_sizes: npt.NDArray[np.int32]
     tables: RoadTables
+    turn: I8
     agents: int
     kind: npt.NDArray[np.int32]
     size: F32
@@ -369,6 +375,7 @@ class Bank:
     program: npt.NDArray[np.float64]
     forced: npt.NDArray[np.int32]
     until: F32
+    walkers: Walkers | None = None
 
 
 def build(  # noqa: PLR0917
@@ -409,6 +416,7 @@ def build(  # noqa: PLR0917
         "style": np.zeros((*shape, 4), np.float32),
         "manner": np.zeros((*shape, 4), np.float32),
         "habit": np.zeros((*shape, 3), np.float32),
+        "courtesy": np.zeros((*shape, 2), np.float32),
         "cruise": np.zeros((*shape, 2), np.float32),
         "route": np.zeros((*shape, 2), np.int32),
         "track": np.zeros((*shape, 2), np.int32),
@@ -455,13 +463,20 @@ def build(  # noqa: PLR0917
     for index, graph in enumerate(town_graphs):
         programs[index, : len(graph.signal_phase)] = signal_programs(graph)
     model_indices = np.asarray(arrays["model"])
+    tables = _tables(town_graphs, pool)
+    # `graphs` may name a town by the path of its map, tables name it by the graph
+    left_hand = {graph.name: bool(graph.left_hand[0]) for graph in town_graphs}
+    walkers = None
+    if has_walkers(episodes):
+        walkers = build_walkers(episodes, graphs, np.asarray(arrays["route"]), tables.path, tables.rule, device)
     return Bank(
         bank,
         _roads(town_graphs, pool, device),
         scripts.build(device),
         scripts.sizes,
         scripts.episode_sizes,
-        _tables(town_graphs, pool),
+        tables,
+        np.concatenate([turn_sides(table.rule[:, 3], left_hand=left_hand[table.town]) for table in pool.tables]),
         agent_count,
         np.where(
             model_indices < 0, int(AgentKind.NONE), np.asarray(arrays["kind"])[np.maximum(model_indices, 0)]
@@ -471,6 +486,7 @@ def build(  # noqa: PLR0917
         programs[np.asarray(arrays["town"])],
         np.asarray(arrays["signal"]),
         np.asarray(arrays["limits"])[:, 3],
+        walkers,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.driving import LaneRelation, Observation, WorldState
 from ssad.core.geometry import to_local
-from ssad.core.types import F32, I32, U8, AgentKind, Bool
+from ssad.core.types import F32, I8, I32, U8, AgentKind, Bool
 from ssad.world.kernels.data import FAR
 
 AHEAD = 40  # route points
@@ -23,7 +23,7 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
     pose = state.pose[scene, agent]
     speed = state.speed[scene, agent]
     route, lane_offset, heading_error, route_point = _route(state, scene, agent, pose)
-    neighbours, relation = _neighbours(state, scene, agent, pose)
+    neighbours, relation, turn_signal = _neighbours(state, scene, agent, pose)
     return Observation(
         scene=scene.copy(),
         agent=agent.copy(),
@@ -39,6 +39,7 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
         others_lane=relation,
         signal=_signal(state, scene, route_point),
         done=ended[scene],
+        others_turn_signal=turn_signal,
         readings={} if readings is None else readings,
     )
 
@@ -58,8 +59,8 @@ def _route(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tuple[An
     return route, offset, heading_error, nearest_point
 
 
-def _neighbours(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tuple[F32, U8]:
-    """`features_by_agent` and `others_lane`."""
+def _neighbours(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tuple[F32, U8, I8]:
+    """`others`, `others_lane` and `others_turn_signal`."""
     pose, kind = state.pose[scene], state.kind[scene]
     positions = to_local(own_pose[:, None], pose[..., :2])
     distance = np.hypot(*np.moveaxis(pose[..., :2] - own_pose[:, None, :2], -1, 0))
@@ -79,7 +80,10 @@ def _neighbours(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tup
     relation = np.zeros((len(scene), NEAREST), np.uint8)
     relations = lane_relations(state, scene, agent)[row_index, nearest_order]
     relation[:, : features.shape[1]] = np.where(visible[row_index, nearest_order], relations, LaneRelation.ELSEWHERE)
-    return features_by_agent, relation
+    turn_signal = np.zeros((len(scene), NEAREST), np.int8)
+    shown = state.turn_signal[scene][row_index, nearest_order]
+    turn_signal[:, : features.shape[1]] = np.where(visible[row_index, nearest_order], shown, 0)
+    return features_by_agent, relation, turn_signal
 
 
 def lane_relations(state: WorldState, scene: I32, agent: I32) -> U8:

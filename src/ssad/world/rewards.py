@@ -12,7 +12,8 @@ import numpy as np
 
 from ssad.core.driving import WorldState
 from ssad.core.geometry import obb_distance, to_local
-from ssad.core.types import F32, F64, I32, Bool, Contact
+from ssad.core.types import F32, F64, I32, MOVING, Bool, Contact
+from ssad.metrics.proven_collisions import AGAINST
 
 GOAL_AHEAD = 6.5  # m along the ego's route from its centre to the adversary's goal (FREA's waypoint buffer)
 GOAL_RADIUS = 2.0  # m
@@ -225,4 +226,84 @@ def feasible(state: WorldState, agents: I32, previous_cost: F64, avoided: Bool, 
     reward: F64 = (
         0.3 * progress - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)
     )
+    return reward
+
+
+def unlawful_cost(state: WorldState, agents: I32, alignment: F32, *, off_road: float, against: float) -> F64:
+    """Return the cost of a step that each adversary spends off the road or against traffic, [N].
+
+    Args:
+        state: After the step.
+        agents: [N, 2] scene and agent of the adversaries.
+        alignment: [N] first number of the sensor `road`.
+        off_road: Cost of a step with the centre off the road.
+        against: Cost of a step whose course differs from that of each lane under the centre by more than 120 degrees.
+    """
+    scene, agent = agents.T
+    is_against = drives_against(state, agents, alignment)
+    cost: F64 = off_road * (state.lane[scene, agent] < 0) + against * is_against
+    return cost
+
+
+def drives_against(state: WorldState, agents: I32, alignment: F32) -> Bool:
+    """Return whether each adversary moves against traffic, [N]; see `ssad.metrics.proven_collisions`."""
+    scene, agent = agents.T
+    moves = np.abs(state.speed[scene, agent]) > MOVING
+    against: Bool = moves & (alignment < np.cos(AGAINST)) & (alignment >= -1.0 - 1e-3)
+    return against
+
+
+def lawful(
+    state: WorldState,
+    agents: I32,
+    previous_cost: F64,
+    alignment: F32,
+    *,
+    off_road: float = 0.5,
+    against: float = 1.0,
+) -> F64:
+    """Return `adversary`, less the cost of being off the road or against traffic, [N].
+
+    Args:
+        state: After the step.
+        agents: [N, 2] scene and agent of the adversaries.
+        previous_cost: [N] `distance_to_goal` before the step.
+        alignment: [N] first number of the sensor `road`.
+        off_road: As of `unlawful_cost`.
+        against: As of `unlawful_cost`.
+    """
+    return adversary(state, agents, previous_cost) - unlawful_cost(
+        state, agents, alignment, off_road=off_road, against=against
+    )
+
+
+def proving(
+    state: WorldState,
+    agents: I32,
+    previous_cost: F64,
+    alignment: F32,
+    proven: Bool,
+    *,
+    off_road: float = 0.5,
+    against: float = 1.0,
+) -> F64:
+    """Return the reward of adversaries that seek proven collisions, [N]; see `ssad.metrics.proven_collisions`.
+
+    A contact with the ego is paid with 30 if it proves something, and costs 3 if not. On the way there, a metre
+    nearer to the goal brings 0.3; the goal itself brings nothing. A contact with anybody else costs 15, as in
+    `adversary`.
+
+    Args:
+        state: After the step.
+        agents: [N, 2] scene and agent of the adversaries.
+        previous_cost: [N] `distance_to_goal` before the step.
+        alignment: [N] first number of the sensor `road`.
+        proven: [N] whether a contact with the ego meets the conditions of a proven collision.
+        off_road: As of `unlawful_cost`.
+        against: As of `unlawful_cost`.
+    """
+    progress = np.clip(previous_cost - distance_to_goal(state, agents), -1.0, 1.0)
+    contact = np.where(hit_ego(state, agents), np.where(proven, 30.0, -3.0), 0.0)
+    cost = unlawful_cost(state, agents, alignment, off_road=off_road, against=against)
+    reward: F64 = 0.3 * progress - 15.0 * hit_others(state, agents) + contact - cost
     return reward

@@ -410,12 +410,14 @@ def rollout(
     by_agent: Drivers = drivers if isinstance(drivers, Mapping) else {0: drivers}
     loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation, policies=policies)
     loop.reset()
-    rows = [_row(simulator.state())]
+    # Traces of episodes without drivers of the population are those of earlier versions, to the byte.
+    shows_signals = any(map(_has_drivers, simulator.episodes))
+    rows = [_row(simulator.state(), turn_signals=shows_signals)]
     lengths = np.zeros(simulator.batch, np.int64)
     for step in range(1, step_limit(simulator) + 1):
         running = simulator.ended() == End.RUNNING
         loop.step()
-        rows.append(_row(simulator.state()))
+        rows.append(_row(simulator.state(), turn_signals=shows_signals))
         # An ended scene keeps standing in the batch; its rows beyond the end are cut below.
         lengths[running] = step
         if (simulator.ended() != End.RUNNING).all():
@@ -430,9 +432,15 @@ def route_signals(graph: LaneGraph, route: Route) -> I32:
     return np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
 
 
-def _row(state: WorldState) -> dict[str, npt.NDArray[np.generic]]:
+def _has_drivers(episode: Episode) -> bool:
+    """Return whether an agent of the episode has a driver of the population."""
+    return any(agent.driver is not None for agent in episode.agents)
+
+
+def _row(state: WorldState, *, turn_signals: bool) -> dict[str, npt.NDArray[np.generic]]:
     """One step of all scenes, in the terms and types of `EpisodeTrace`: first what all agents have, then the ego's."""
-    return {
+    shown = {"turn_signal": state.turn_signal.copy()} if turn_signals else {}
+    return shown | {
         "x": state.pose[..., 0].copy(),
         "y": state.pose[..., 1].copy(),
         "yaw": state.pose[..., 2].copy(),
@@ -461,8 +469,10 @@ def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: in
     graph = simulator.graphs[episode.town]
     state = simulator.state()
     agent_count = int((state.kind[b] != AgentKind.NONE).sum())
-    agent_fields: dict[str, Any] = {name: rows[name][:steps, b, :agent_count].copy() for name in _AGENT}
-    ego_fields: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name not in _AGENT}
+    agent_names = (*_AGENT, "turn_signal") if _has_drivers(episode) else _AGENT
+    agent_fields: dict[str, Any] = {name: rows[name][:steps, b, :agent_count].copy() for name in agent_names}
+    ego_names = set(rows) - {*_AGENT, "turn_signal"}
+    ego_fields: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name in ego_names}
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
     signal_ids = route_signals(graph, route)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError, install_extra
-from ssad.core.top_view import TopView, TopViewScene
+from ssad.core.top_view import TopView, TopViewScene, lit_turn_signals
 from ssad.core.types import U8
 from ssad.world.world import World
 
@@ -34,6 +34,7 @@ class SceneViews:
         near_signals = np.flatnonzero(np.linalg.norm(graph.signal_xy.reshape(-1, 2) - pose[0, :2], axis=1) < NEAR)
         signals = [(*map(float, graph.signal_xy[signal]), int(signal_states[signal])) for signal in near_signals]
         time, completion = float(state.time[scene]), float(state.route_complete[scene])
+        has_drivers = any(agent.driver is not None for agent in episode.agents)
         return self._towns[episode.town].draw(
             TopViewScene(
                 pose,
@@ -44,6 +45,7 @@ class SceneViews:
                 np.zeros((0, 2)),
                 signals,  # type: ignore[arg-type]
                 hit=6 if state.contact[scene] else None,
+                turn_signal=lit_turn_signals(state.turn_signal[scene], time) if has_drivers else None,
                 words=[f"{time:5.1f} s   {float(state.speed[scene, 0]):5.1f} m/s   route {completion:3.0f} %"],
             )
         )

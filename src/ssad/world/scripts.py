@@ -38,8 +38,10 @@ def script_motion(agent: EpisodeAgent) -> ScriptMotion:
     """Return the way in which the world moves an agent by its script.
 
     Agents with lateral phases move exactly along their route, and so do walkers on a route that bends: they do not
-    steer.
+    steer. Walkers of natural traffic move as `ssad.world.kernels.walkers` says.
     """
+    if agent.walk is not None:
+        return ScriptMotion.WALK
     if not (agent.phases or agent.lateral or (agent.controller == Controller.SCRIPT and agent.speed > 0.0)):
         return ScriptMotion.NONE
     is_walker = agent.model in MODELS and MODELS[agent.model].kind == AgentKind.WALKER

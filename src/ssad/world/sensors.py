@@ -11,13 +11,15 @@ import warp as wp
 from ssad.core.driving import Belief, BeliefSimulator, Sensor
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, I32
-from ssad.world.kernels.look import CHANNELS, OBSERVATION, look, look_as_adversary, look_from_above
+from ssad.world.kernels.look import CHANNELS, OBSERVATION, ROAD, look, look_as_adversary, look_at_road, look_from_above
 from ssad.world.kernels.look_traffic import TRAFFIC, look_at_traffic
 from ssad.world.world import World
 
 ABOVE = 64  # pixels a side of the view from above
 PIXELS = 2.0  # a metre
 BEHIND = 8.0  # m
+# m, m, m, m, rad and m/s of the rows of the sensor `adversary`, and m, m, m, m, rad and m of the goal, which are 1
+_ADVERSARY_UNITS = np.array([10.0, 10.0, 5.0, 2.0, 1.0, 10.0] * 3 + [10.0, 10.0, 2.0, 2.0, 1.0, 10.0], np.float32)
 
 
 def launcher(world: World, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> tuple[Any, Any]:
@@ -44,7 +46,7 @@ class _Rows:
         return table[:, self.first : self.end].copy()
 
 
-_KERNELS = {"look": look, "look_as_adversary": look_as_adversary}
+_KERNELS = {"look": look, "look_as_adversary": look_as_adversary, "look_at_road": look_at_road}
 
 
 def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> F32:
@@ -106,19 +108,30 @@ def traffic(simulator: Any, agents: I32) -> F32:
     return _read(simulator, look_at_traffic, agents, (len(agents), TRAFFIC), len(agents), float(simulator.dt)).copy()
 
 
+def adversary_on_road(simulator: Any, agents: I32) -> F32:
+    """Return what an adversary that keeps to the law observes, [N, 45], all numbers around 1; see `SENSORS`."""
+    rows = SENSORS["adversary"](simulator, agents) / _ADVERSARY_UNITS
+    return np.concatenate([rows, SENSORS["road"](simulator, agents)], 1, dtype=np.float32)
+
+
 SENSORS: dict[str, Sensor] = {
     "safebench": _Rows("look", OBSERVATION, 0, 4),
     "frea": _Rows("look", OBSERVATION, 4, OBSERVATION),
     "adversary": _Rows("look_as_adversary", 24, 0, 24),
+    "road": _Rows("look_at_road", ROAD, 0, ROAD),
+    "adversary-on-road": adversary_on_road,
     "traffic": traffic,
     "above": from_above(),
     "truth": truth,
 }
 """`safebench` [N, 4]: lateral offset m, heading error rad, speed m/s, 1 if a vehicle is in the same lane within 15 m
 ahead. `frea` [N, 24]: 4 rows of 6, the agent, the two nearest vehicles and the route. `adversary` [N, 24]: FREA's
-adversary, the ego, the nearest other vehicle and the goal. `traffic` [N, 69]: speed / 10, acceleration / 5, front-wheel
-angle / 0.5, target speed / 10, offset from the route / 2, heading error, metres to its end / 50; x / 20, y / 20 of the
-route 4, 8, 12, 18, 26 and 34 m ahead; for now and after 1, 2, 3, 4 s, if everybody keeps speed and rate of turn, metres
-along the route to the first body on it / 50 (1: none) and that body's speed along the route / 10; for the five nearest
-within 50 m (those behind count as twice as far) x / 25, y / 25, cosine and sine of the heading, speed / 10, length / 5,
-width / 2, and 1 for who is on two wheels or on foot. `above`: see `from_above`. `truth`: a `Belief`, see `truth`."""
+adversary, the ego, the nearest other vehicle and the goal. `road` [N, 21]: cosine between the agent's course and the
+lane under its centre that fits best (-2: off the road), and that of 20 points around and ahead (-1: off the road).
+`adversary-on-road` [N, 45]: `adversary` scaled to numbers around 1, and `road`. `traffic` [N, 69]: speed / 10,
+acceleration / 5, front-wheel angle / 0.5, target speed / 10, offset from the route / 2, heading error, metres to its
+end / 50; x / 20, y / 20 of the route 4, 8, 12, 18, 26 and 34 m ahead; for now and after 1, 2, 3, 4 s, if everybody
+keeps speed and rate of turn, metres along the route to the first body on it / 50 (1: none) and that body's speed along
+the route / 10; for the five nearest within 50 m (those behind count as twice as far) x / 25, y / 25, cosine and sine
+of the heading, speed / 10, length / 5, width / 2, and 1 for who is on two wheels or on foot. `above`: see
+`from_above`. `truth`: a `Belief`, see `truth`."""

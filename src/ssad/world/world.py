@@ -17,7 +17,7 @@ from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
-from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
+from ssad.core.types import F32, I8, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
 from ssad.world.belief import Lanes, check, complete_belief, lanes_of, rest_times
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import fill_all_rows
@@ -29,29 +29,32 @@ from ssad.world.kernels.data import (
     Presence,
     ScriptState,
     State,
+    WalkState,
     Work,
     array_types,
 )
 from ssad.world.kernels.drive import drive
+from ssad.world.kernels.lane_choice import change_lanes
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import advance_noise, reset_noise
-from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.script import restart_scripts, run_scripts
 from ssad.world.kernels.traffic import react_to_agents, scan_all_agents
+from ssad.world.kernels.walkers import restart_walks, walk_all, yield_to_walkers
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
+from ssad.world.turn_signals import turn_signals
 
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
-_SCRIPT = array_types(ScriptState)
+_SCRIPT, _WALK = array_types(ScriptState), array_types(WalkState)
 # The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
 _OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
 _IMMUTABLE = ("episodes", "graphs", "models", "bank")  # attributes that deep copies share
 # Attributes that live on the device or refer to it: a copy makes its own.
 _ON_DEVICE = (
-    *("arrays", "seen", "ego", "script", "controls", "places", "_mask", "work", "noise", "_views", "_looks"),
+    *("arrays", "seen", "ego", "script", "walk", "controls", "places", "_mask", "work", "noise", "_views", "_looks"),
     *("_restart", "_see", "_plan", "_advance", "_graph"),
 )
 
@@ -150,6 +153,10 @@ class World:
             # a world without scripts keeps none
             script_shape = script_shape if self._scripted else (1, 1)
             setattr(self.script, name, wp.zeros(script_shape, dtype=array_type.dtype, device=device))
+        self.walk = WalkState()
+        for name, array_type in _WALK.items():
+            walk_shape = agent_shape if self._walks else (1, 1)
+            setattr(self.walk, name, wp.zeros(walk_shape, dtype=array_type.dtype, device=device))
         self.controls = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self.places = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
@@ -222,7 +229,7 @@ class World:
         pair_threads = 1 if self.device == "cpu" else min(pair_capacity, 1 << 21)
         dt, substeps, autoreset = self._settings
         bank, roads, state, perceived = self.bank.episodes, self.bank.roads, self.arrays, self.seen
-        scripts = self.bank.scripts
+        scripts, walkers = self.bank.scripts, self.bank.walkers
 
         # threads of a scene: on CPU to begin one costs more than what most of them have to do
         agent_threads = 1 if self.device == "cpu" else self.agents
@@ -237,9 +244,14 @@ class World:
             if self._scripted:
                 script_inputs = [bank, roads, scripts, state, self.script, self._mask, ended_too, self.agents]
                 script_reset = [self.launch(restart_scripts, self.batch, [*script_inputs, *self.bank.script_rows])]
+            walk_reset = []
+            if self._walks:
+                walk_inputs = [bank, roads, walkers, state, self.walk, self._mask, ended_too, self.agents]
+                walk_reset = [self.launch(restart_walks, self.batch, walk_inputs)]
             return [
                 *noise_reset,
                 *script_reset,
+                *walk_reset,
                 self.launch(
                     restart, launch_shape, [bank, roads, state, self._mask, ended_too, self.agents, agent_threads]
                 ),
@@ -260,6 +272,17 @@ class World:
                 launch_shape,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, agent_threads, dt],
             ),
+            *(
+                [
+                    self.launch(
+                        yield_to_walkers,
+                        launch_shape,
+                        [bank, roads, walkers, state, perceived, self.walk, self.agents, agent_threads],
+                    )
+                ]
+                if self._walks
+                else []
+            ),
             self.launch(
                 react_to_agents,
                 pair_threads,
@@ -273,6 +296,17 @@ class World:
             *(
                 [self.launch(run_scripts, self.batch, [bank, roads, scripts, state, self.script, self.agents, dt])]
                 if self._scripted
+                else []
+            ),
+            *(
+                [
+                    self.launch(
+                        walk_all,
+                        self.batch,
+                        [bank, roads, walkers, state, self.script, self.walk, self.agents, dt],
+                    )
+                ]
+                if self._walks
                 else []
             ),
             self.launch(
@@ -297,16 +331,22 @@ class World:
     def names(self) -> tuple[str, ...]:
         """Names of the arrays that hold everything that changes, as long as no ego plans over a belief."""
         script_names = _SCRIPT if self._scripted else ()
+        walk_names = _WALK if self._walks else ()
         return (
             *_STATE,
             *(f"ego.{name}" for name in _EGO),
             *(f"noise.{name}" for name in self._noisy),
             *(f"script.{name}" for name in script_names),
+            *(f"walk.{name}" for name in walk_names),
         )
 
     @property
     def _scripted(self) -> bool:
         return self.bank.script_rows[0] > 0
+
+    @property
+    def _walks(self) -> bool:
+        return self.bank.walkers is not None
 
     @property
     def _noisy(self) -> tuple[str, ...]:
@@ -352,8 +392,8 @@ class World:
         """Return an array as numpy: a view on CPU, a copy on CUDA.
 
         Args:
-            name: Name of a state array; `ego.<name>`, `seen.<name>`, `noise.<name>` or `script.<name>` for the other
-                groups.
+            name: Name of a state array; `ego.<name>`, `seen.<name>`, `noise.<name>`, `script.<name>` or `walk.<name>`
+                for the other groups.
         """
         view = self._views.get(name)
         if view is None:
@@ -368,7 +408,8 @@ class World:
         group, _, member = name.rpartition(".")
         if group == "noise":
             return getattr(self.noise, member)
-        return getattr({"": self.arrays, "ego": self.ego, "seen": self.seen, "script": self.script}[group], member)
+        groups = {"": self.arrays, "ego": self.ego, "seen": self.seen, "script": self.script, "walk": self.walk}
+        return getattr(groups[group], member)
 
     def put(self, name: str, value: npt.NDArray[Any]) -> None:
         """Fill the array that `array(name)` reads."""
@@ -672,6 +713,25 @@ class World:
             red_light=(self.array("ego.red_light") == 1).astype(np.uint8),
             stop_sign=self.array("ego.stop_sign").astype(np.uint8),
             note=self.array("note"),
+            turn_signals=self._turn_signals,
+        )
+
+    def _turn_signals(self) -> I8:
+        """Return `TurnSignal` [B, A]."""
+        constants = self._fixed
+        route, controller = constants["route"], self.array("controller")
+        point = route[..., 0] + self.array("progress")
+        return turn_signals(
+            shift=self.array("shift"),
+            along=self.array("aim")[..., 0],
+            speed=self.array("speed"),
+            junction_distance=self.bank.tables.rule[point, 2],
+            turn=self.bank.turn[point],
+            half_length=np.float32(0.5) * constants["size"][..., 0],
+            indicates=(controller == Controller.AUTOPILOT)
+            & (route[..., 1] > 1)
+            & (constants["kind"] != AgentKind.WALKER)
+            & (self.array("active") == Presence.AWAKE),
         )
 
     def _signals(self, time: npt.NDArray[np.float64]) -> U8:
@@ -704,7 +764,8 @@ class World:
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world. Raises ConfigError if its shape does not fit."""
-        for group, is_present in (("noise", bool(self._noisy)), ("script", self._scripted)):
+        groups = (("noise", bool(self._noisy)), ("script", self._scripted), ("walk", self._walks))
+        for group, is_present in groups:
             if any(name.startswith(f"{group}.") for name in snapshot.arrays) != is_present:
                 raise ConfigError(f"snapshot does not fit this world: only one of them has {group}")
         saved_rows = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
@@ -741,7 +802,7 @@ class World:
                 if name == "pending" and not scene_values.any():
                     # hashes are those of before there were drivers that react
                     continue
-                if name.startswith("script."):
+                if name.startswith(("script.", "walk.")):
                     if not scene_values.any():
                         continue  # a scene without scripts has the hash that it has in a world without scripts
                     if name in ("script.begun", "script.ended", "script.history"):

@@ -42,6 +42,26 @@ def test_the_generator_proposes_the_corners_first() -> None:
     assert len({tuple(sorted(o.proposal.scenario.parameters.items())) for o in first}) == 4
 
 
+def test_the_adversary_proves_that_the_driver_follows_too_closely(tmp_path: Path) -> None:
+    """A driver that looks 4 m ahead, from its middle, sees nobody in time; one with a safe gap would have stopped."""
+    import ssad
+
+    found = ssad.run(
+        "adversarial-quick",
+        set={
+            "systems": ["example-careful?reach=4@short", "autopilot"],
+            "generators": ["example-brake-test"],
+            "scenarios": [str(FOLDER / "lead.yaml")],
+        },
+        out=tmp_path / "run",
+        workers=0,
+        quiet=True,
+    )
+    assert not found.failures
+    proven = {row["system"]: row["metrics"]["proven"] for row in found.rows}
+    assert proven == {"short": True, "autopilot": False}
+
+
 def test_the_kind_runs(tmp_path: Path) -> None:
     import ssad
 

@@ -30,7 +30,6 @@ from ssad.experiments.adversarial.kind import Adversarial
 from ssad.experiments.adversarial.search_scores import distinct_collisions, summary
 from ssad.experiments.runs import write_report
 from ssad.experiments.suites import load_suite
-from ssad.metrics.realism import FEATURES
 from ssad.report.compare import compare_runs
 from ssad.scenarios.dynamic import load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.generate import Trials
@@ -142,9 +141,9 @@ def test_candidates_alone_are_driven_again_and_graded(monkeypatch: pytest.Monkey
         driven.extend(episodes)
         return [replay(), replay(), replay(end="complete")]
 
-    graded = [SimpleNamespace(metrics=lambda: AVOIDED), SimpleNamespace(metrics=lambda: dict.fromkeys(AVOIDED, 0.0))]
+    avoiders = [{"cc": True, "rss": False}, {"cc": False, "rss": False}]
     monkeypatch.setattr("ssad.scenarios.dynamic.generate.scenario_of", lambda outcome, base, name: outcome)
-    monkeypatch.setattr("ssad.simulators.closed_loop.grades_of", lambda drives, device: graded[: len(drives)])
+    monkeypatch.setattr("ssad.simulators.proofs.avoiders_of", lambda drives, device: avoiders[: len(drives)])
     trials: Any = SimpleNamespace(bases=drive_again, device="cpu")
     assert proven_bases(bases, rows, trials, limit=1) == [True, False, False, False]
     assert [(outcome, seed) for outcome, _, seed in driven] == [(rows[k][0], 8) for k in (0, 2, 3)]
@@ -206,7 +205,6 @@ actors:
 def test_the_ranges_of_a_scenario_with_actors_of_its_own_are_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, generator: str
 ) -> None:
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: {})
     outcomes: list[Outcome] = []
     run_trials = Trials.run
 
@@ -235,7 +233,6 @@ def test_the_ranges_of_a_scenario_with_actors_of_its_own_are_searched(
 def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: {})
     kind = Adversarial()
     settings = ["generators=king", "budget=1", "scenarios=[StraightObstacle/00]"]
     with pytest.raises(ConfigError, match=r"generator king: scenario StraightObstacle/00: there is no vehicle in it"):
@@ -248,8 +245,6 @@ def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_se
 
 
 def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: usual)
     kind = Adversarial()
     settings = [
         "generators=halton",
@@ -269,6 +264,7 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert metrics["replayed"] == 1.0
     assert 0.0 < metrics["seconds_first"] <= metrics["seconds"]
     assert 0.0 < metrics["realism"] < 1.0
+    assert 0.0 < metrics["within_published"] <= 1.0
     # the grade of the one that is saved: any careful driver, or at least a manoeuvre
     careful = [metrics[f"avoided_by_{name}"] for name in ("cc", "reg157", "rss", "fsm")]
     assert metrics["attributable"] == max(careful)
@@ -292,8 +288,6 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
 def test_equal_runs_have_the_same_hash_and_are_equal_however_long_they_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: usual)
     settings = ["generators=halton", "budget=8", "grade=false", "scenarios=UnprotectedLeftTurn/00", "systems=autopilot"]
     plan = Adversarial().plan(load_suite("adversarial-quick", settings), check=False)
     folders, hashes, tables = [tmp_path / "fast", tmp_path / "slow"], [], []

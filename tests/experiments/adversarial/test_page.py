@@ -146,10 +146,10 @@ def test_groups_have_their_own_rates_and_failures_count(found: Run) -> None:
 def test_natural_and_adversarial_traffic_stand_side_by_side(found: Run) -> None:
     assert traffic_table(found) is None
     spec = {"repetition": 0, "scenario": {"type": "NaturalJunction", "town": "Twinford"}}
-    lines = [line("adv-ppo", k, 1, spec=spec, survived=k > 1) for k in range(8)]
+    lines = [line("adv-ppo-paper", k, 1, spec=spec, survived=k > 1) for k in range(8)]
     for one in lines[2:]:
         one["metrics"]["CR_any"] = one["cluster"] != "base 7"
-    table = traffic_table(run([*lines, line("adv-ppo", 9, 1)]))
+    table = traffic_table(run([*lines, line("adv-ppo-paper", 9, 1)]))
     assert table is not None
     ours = [row for row in table.rows if not row.published]
     assert [row.head for row in ours] == [("autopilot", "natural", "Twinford"), ("autopilot", "Adv.PPO", "Twinford")]

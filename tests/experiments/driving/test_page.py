@@ -6,6 +6,7 @@ import base64
 import csv
 import html.parser
 import io
+import itertools
 import json
 import re
 import zlib
@@ -26,6 +27,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.lane_strips import simplify_polyline
 from ssad.core.safeio import to_plain_json
 from ssad.core.traces import load_trace, save_trace
+from ssad.core.types import TurnSignal
 from ssad.drivers import make_system
 from ssad.experiments.driving.driving_tables import average_note, full_table, precrash_table, summary_table
 from ssad.experiments.driving.embed import SCALE, encode_int16, episode_data, origin, town_data
@@ -38,6 +40,7 @@ from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
 from ssad.report.tables import tex, to_csv, to_latex, to_markdown
 from ssad.report.terminal import terminal_table
+from ssad.report.video import frames
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.roads import load_town, save_graph
 from ssad.world.rollout import rollout
@@ -243,6 +246,20 @@ def test_episode_record_is_in_thousandths(run_folder: Path) -> None:
     np.testing.assert_allclose(record[4] / 10, trace.route_complete, atol=0.1)
     low, high = graph.xy.min(axis=0), graph.xy.max(axis=0)
     np.testing.assert_allclose(origin(graph), 0.5 * (low + high), atol=0.06)
+
+
+def test_turn_signals_are_in_the_replay_where_they_change_and_flash_in_the_video(run_folder: Path) -> None:
+    trace = load_trace(run_folder / "traces" / "blind0.npz")
+    graph = load_town(trace.town)
+    assert episode_data(trace, graph)["turn_signals"] == []
+    signals = np.zeros(trace.x.shape, np.int8)
+    signals[4:9, 0] = TurnSignal.RIGHT
+    indicating = replace(trace, turn_signal=signals)
+    assert episode_data(indicating, graph)["turn_signals"] == [[0, [[0, 0], [4, -1], [9, 0]]]]
+    dark, lit = (list(itertools.islice(frames(each, graph, size=(320, 180)), 10)) for each in (trace, indicating))
+    differs = [step for step in range(10) if (dark[step] != lit[step]).any()]
+    assert differs == [step for step in range(4, 9) if int(3.0 * step * trace.dt + 1e-6) % 2 == 0]
+    assert differs
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])

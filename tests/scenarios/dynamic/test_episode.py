@@ -109,8 +109,8 @@ def test_what_a_scenario_leaves_open_is_its_types() -> None:
     episode = build_episode(own, town, seed=0)
     assert (episode.limits, episode.override_until) == (EpisodeLimits(max_steps=7, max_distance=80.0), 4.0)
     assert set(episode.signal_override.values()) == {SignalState.RED}
-    (scenario,) = load_scenarios("natural-unselected/Twinford_00/01")
-    town = load_town("Twinford")
+    (scenario,) = load_scenarios("natural-unselected/Twinford_00/00")
+    scenario, town = replace(scenario, traffic=None), load_town("Twinford")
     assert build_episode(scenario, town, seed=0).scenario.traffic == TrafficPlan()
     few = replace(scenario, traffic=TrafficPlan(minimum=1, maximum=1))
     episode = build_episode(few, town, seed=0)

@@ -220,6 +220,9 @@ def test_a_contact_with_an_adversary_is_measured(graph: Any) -> None:
     assert (hit.time, hit.impact_speed, hit.ego_speed) == pytest.approx((2.0, 14.0, 8.0))
     assert hit.gap == 0.0
     assert hit.danger == pytest.approx(1.4)
+    assert hit.proof_value == pytest.approx(2.4)
+    assert dataclasses.replace(hit, ego_speed=0.2).proof_value == -0.5
+    assert dataclasses.replace(hit, off_road=True).proof_value == -1.0
     other = measure(Proposal(load_scenarios("precrash")[0]), trace, graph, [2])
     assert not other.collision
     assert other.impact_speed is None
@@ -250,8 +253,9 @@ def test_an_adversary_that_leaves_the_road_is_seen_and_one_that_joins_it_is_not(
     start = (middle[0] + 27 * math.cos(away), middle[1] + 27 * math.sin(away))
     joins = make_trace(31, [ahead(0, 500), ahead(9, *start, away + math.pi)])
     assert not measure(proposal, joins, graph, [1]).off_road
-    walker = dataclasses.replace(leaves, kind=np.array([1, 6], np.uint8))
-    assert not measure(proposal, walker, graph, [1]).off_road
+    for kind in (5, 6):  # cyclists and walkers may
+        walker = dataclasses.replace(leaves, kind=np.array([1, kind], np.uint8))
+        assert not measure(proposal, walker, graph, [1]).off_road
 
 
 def test_an_adversary_that_comes_to_drive_against_traffic_leaves_its_road(graph: Any) -> None:
@@ -263,15 +267,17 @@ def test_an_adversary_that_comes_to_drive_against_traffic_leaves_its_road(graph:
     x, y, yaw, _ = graph.along(lane, at).T
     width = 0.5 * (graph.width[graph.points(lane)][0] + graph.width[graph.points(opposite)][0])
 
-    def leaves(lateral: Any, heading: float = 0.0) -> bool:
+    def leaves(lateral: Any, heading: float = 0.0, kind: int = 1) -> bool:
         body = (x - lateral * np.sin(yaw), y + lateral * np.cos(yaw), yaw + heading, 10.0)
-        trace = make_trace(31, [ahead(0, 500, 9000.0), body])
+        trace = dataclasses.replace(make_trace(31, [ahead(0, 500, 9000.0), body]), kind=np.array([1, kind], np.uint8))
         return measure(Proposal(load_scenarios("precrash")[0]), trace, graph, [1]).off_road
 
     side = width * np.clip((np.arange(31) - 5) / 10, 0, 1)
     assert not leaves(0.0)
     assert not leaves(side, math.pi)  # it faces the other way: from the wrong side to its own
     assert leaves(side)
+    assert leaves(side, kind=5)  # a cyclist may leave the road, but not ride against traffic
+    assert not leaves(side, kind=6)
     assert not leaves(width)  # it has left nothing
 
 

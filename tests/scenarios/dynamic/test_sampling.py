@@ -87,6 +87,7 @@ LATER |= {"all": (), "any": (), "gap": None}
 LATER |= {"impact": None, "declared": {}, "expressions": {}, "constraints": ()}
 LATER |= {"body": Body(), "ego_body": Body(), "ego_model": "car", "friction": Scenario.friction, "heights": ()}
 LATER |= {"elsewhere": "program", "driver": None, "drivers": "uniform", "errors": 0.0, "walkers": 0, "cyclists": 0}
+LATER |= {"walk": None}
 # ten draws of traffic on so many junction routes of a town, as the set `natural` then was
 ROUTES = {"Twinford": 7, "Crossgate": 8}
 
@@ -127,7 +128,9 @@ def test_without_spread_the_episodes_are_what_they_were(name: str) -> None:
         every = {s.name: s for s in load_scenarios("natural-unselected")}
         routes = [f"{name}_{i:02d}" for i in range(ROUTES[name])]
         scenarios = [
-            dataclasses.replace(every[f"natural-unselected/{route}/00"], name=f"natural/{route}/{k:02d}", seed=k)
+            dataclasses.replace(
+                every[f"natural-unselected/{route}/00"], name=f"natural/{route}/{k:02d}", seed=k, traffic=None
+            )
             for route in routes
             for k in range(10)
         ]

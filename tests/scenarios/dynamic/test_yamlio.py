@@ -320,7 +320,9 @@ def test_the_shipped_sets_have_the_numbers_of_the_paper() -> None:
     assert len(load_scenarios("natural")) == 150
     assert sum(len(load_scenarios(f"natural-{town}")) for town in ("twinford", "crossgate")) == 150
     assert len(load_scenarios("natural-unselected")) == 150
-    assert len({s.name for name in ("precrash", "natural", "natural-unselected") for s in load_scenarios(name)}) == 332
+    assert len(load_scenarios("natural-uniform")) == 150
+    names = ("precrash", "natural", "natural-unselected", "natural-uniform")
+    assert len({s.name for name in names for s in load_scenarios(name)}) == 482
     assert load_scenarios("RightTurn/02") == (load_scenarios("RightTurn")[2],)
 
 
@@ -472,7 +474,8 @@ def test_nothing_cannot_be_saved_and_one_of_several_may_be_wrong(tmp_path: Path)
 def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     towns, learned = ("natural-crossgate", "natural-twinford"), ("training", "training-lanes")
-    shipped = ("lane-traffic", "natural", *towns, "natural-unselected", "precrash", "stop-signs", *learned)
+    drawn = ("natural-uniform", "natural-unselected")
+    shipped = tuple(sorted(("lane-traffic", "natural", *towns, *drawn, "precrash", "stop-signs", *learned)))
     assert set_names() == shipped
     mine = scenario_from({**PLAIN, "name": "mine/0"})
     save_scenarios(ssad_home / "scenarios" / "mine.yaml", mine)

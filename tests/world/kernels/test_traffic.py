@@ -9,7 +9,7 @@ import pytest
 from helpers.quick import others_slow
 
 from benchmarks.traffic import LENGTH, ROUTES, between_lanes, measure, town_routes, traffic, upper_limit
-from ssad.core.types import ENDS, Controller, EpisodeAgent, Pose
+from ssad.core.types import ENDS, AgentKind, Controller, EpisodeAgent, Pose
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.roads import load_town
 from ssad.world.world import World
@@ -34,14 +34,16 @@ def test_autopilot_gives_way_to_those_who_do_not(name: str) -> None:
     assert ENDS[run(name, Controller.AUTOPILOT).ended()[0]] == "complete"
 
 
-def test_natural_traffic_hurts_nobody_and_gets_through() -> None:
-    scenarios = load_scenarios("natural")
+@pytest.mark.parametrize(("name", "every"), [("natural-uniform", 1), ("natural", 3)])
+def test_natural_traffic_hurts_nobody_and_gets_through(name: str, every: int) -> None:
+    scenarios = load_scenarios(name)[::every]
     graphs = {s.town: load_town(s.town) for s in scenarios}
     world = World([build_episode(s, graphs[s.town], seed=0) for s in scenarios], graphs, ego=Controller.AUTOPILOT)
     touched = np.zeros(world.batch, bool)
+    vehicles = world.state().kind != AgentKind.WALKER  # groups of walkers brush against each other
     for _ in range(300):
         world.step()
-        touched |= (world.array("touch") != 0).any(axis=1)
+        touched |= ((world.array("touch") != 0) & vehicles).any(axis=1)
     assert (world.ended() == ENDS.index("collision")).mean() <= 0.02
     assert touched.mean() <= 0.02
     assert world.array("ego.complete").mean() >= 95.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
@@ -485,6 +486,33 @@ def test_doubts_name_the_lanelet(tmp_path: Path, pattern: str, replacement: str,
     assert doubt in report.doubts
     with pytest.raises(MapError, match="without --strict"):
         report.refuse_doubts(MapError)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "problem"),
+    [
+        (
+            r'<way id="[36]">',
+            '<way id="99{}">',
+            "way 3: no lanelet in it has a bound with points: the map lacks this line",
+        ),
+        (r'<nd ref="1"/>', '<nd ref="77"/>', "way 3, node 77: no lanelet in it has a shape: a line refers to a point"),
+        (r'<nd ref="1"/>', "", "lanelet 7, way 3: no lanelet in it has a shape: a bound has fewer than two points"),
+        (r'role="right"', 'role="rite"', "lanelet 7: no lanelet in it has a shape: a lanelet lacks a bound"),
+    ],
+)
+def test_a_map_without_any_lanelet_names_the_element_at_fault(
+    tmp_path: Path, pattern: str, replacement: str, problem: str
+) -> None:
+    road = MapWriter()
+    road.lanelet(straight(0, 30, 2), straight(0, 30, -2))
+    numbers = itertools.count()
+    text = re.sub(pattern, lambda _: replacement.format(next(numbers)), road.text())
+    assert text != road.text()
+    (tmp_path / "map.osm").write_text(text, encoding="utf-8")
+    with pytest.raises(MapError) as refused:
+        bake(tmp_path / "map.osm")
+    assert f"map.osm: {problem}" in str(refused.value)
 
 
 @pytest.mark.parametrize(

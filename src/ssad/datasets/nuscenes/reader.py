@@ -21,6 +21,7 @@ from ssad.core.folders import is_file_name
 from ssad.core.import_report import ImportReport
 from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
+from ssad.core.wording import counted
 from ssad.datasets.nuscenes.index import Index, open_index
 from ssad.datasets.nuscenes.scene import (
     Annotations,
@@ -88,7 +89,7 @@ class NuScenes:
     def report(self) -> ImportReport:
         """Return a report on the folder: its scenes, and tables and folders that are not read."""
         report = ImportReport(str(self.root))
-        report.contents.append(f"nuScenes schema {self.version}: {len(self.scenes())} scenes")
+        report.contents.append(f"nuScenes schema {self.version}: {counted(len(self.scenes()), 'scene')}")
         for path in sorted((self.root / self.version).glob("*.json")):
             if path.stem not in TABLES:
                 report.omit("tables that are not read", f"{self.version}/{path.name}")

@@ -183,6 +183,59 @@ def grade_collisions(
     if not drives:
         return []
     run_options: dict[str, Any] = {"device": device, "policies": policies, "sensors": sensors}
+    encounters = _play_again(drives, run_options)
+    limits = _limits(
+        drives, [encounter.start for encounter in encounters], [encounter.end for encounter in encounters], run_options
+    )
+    grades = []
+    for encounter, limit in zip(encounters, limits, strict=True):
+        verdict: Verdict = "unavoidable" if limit.manoeuvre is None else "limit"
+        if any(encounter.avoids.values()):
+            verdict = "avoidable"
+        grades.append(
+            Grade(verdict, encounter.avoids, encounter.start, encounter.end, encounter.agent, encounter.is_exact, limit)
+        )
+    return grades
+
+
+def careful_drivers_avoid(
+    drives: Sequence[Drive],
+    *,
+    device: str = "cpu",
+    policies: Policies | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+) -> list[Mapping[str, bool]]:
+    """Return for the first collision of each drive which careful models stay clear, by short name.
+
+    As `grade_collisions`, without the kinematic limit, whose search takes most of the time.
+    """
+    if not drives:
+        return []
+    options: dict[str, Any] = {"device": device, "policies": policies, "sensors": sensors}
+    return [encounter.avoids for encounter in _play_again(drives, options)]
+
+
+@dataclass(frozen=True)
+class _Encounter:
+    """A collision, driven again by the careful models.
+
+    Attributes:
+        avoids: Short name of a careful model -> True if it stays clear.
+        start: s at which the danger begins.
+        end: s of the contact.
+        agent: Index of the agent that was hit; -1: unknown.
+        is_exact: As `Grade.exact`.
+    """
+
+    avoids: Mapping[str, bool]
+    start: float
+    end: float
+    agent: int
+    is_exact: bool
+
+
+def _play_again(drives: Sequence[Drive], run_options: Mapping[str, Any]) -> list[_Encounter]:
+    """Find out when the danger of each drive begins, and hand the ego to each careful model from then on."""
     contacts = [first_contact(trace) for _, _, trace in drives]
     contact_times = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
     no_takeover = Takeover(Careful(), math.inf)
@@ -207,18 +260,16 @@ def grade_collisions(
         ],
         **run_options,
     )
-    limits = _limits(drives, takeover_times, contact_times, run_options)
-    grades = []
-    for index, (model_hits, limit) in enumerate(zip(collided, limits, strict=True)):
-        avoids = {name: not bool(is_hit) for name, is_hit in zip(MODELS, model_hits, strict=True)}
-        verdict: Verdict = "unavoidable" if limit.manoeuvre is None else "limit"
-        if any(avoids.values()):
-            verdict = "avoidable"
-        exact = bool(observer.same[index, danger_steps[index]])
-        grades.append(
-            Grade(verdict, avoids, takeover_times[index], contact_times[index], contacts[index][1], exact, limit)
+    return [
+        _Encounter(
+            avoids={name: not bool(is_hit) for name, is_hit in zip(MODELS, model_hits, strict=True)},
+            start=takeover_times[index],
+            end=contact_times[index],
+            agent=contacts[index][1],
+            is_exact=bool(observer.same[index, danger_steps[index]]),
         )
-    return grades
+        for index, model_hits in enumerate(collided)
+    ]
 
 
 def _limits(

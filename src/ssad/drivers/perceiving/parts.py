@@ -332,5 +332,10 @@ def restore_part(part: Any, snapshot: Any) -> Any:
 
 def hide_truth(view: Observation, *, readings: bool) -> Observation:
     """Return an observation without the true state of other agents, and without readings where asked."""
-    hidden = replace(view, others=np.zeros_like(view.others), others_lane=np.zeros_like(view.others_lane))
+    hidden = replace(
+        view,
+        others=np.zeros_like(view.others),
+        others_lane=np.zeros_like(view.others_lane),
+        others_turn_signal=None,
+    )
     return hidden if readings else replace(hidden, readings={})

@@ -11,9 +11,8 @@ import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
-from ssad.core.types import Episode, Scenario
+from ssad.core.types import MOVING, Episode, Scenario
 from ssad.experiments.adversarial.search_scores import distinct_collisions
-from ssad.metrics.proven_collisions import MOVING
 
 if TYPE_CHECKING:
     from ssad.scenarios.dynamic.generate import Trials
@@ -107,32 +106,17 @@ def proven_bases(bases: Sequence[Base], rows: Sequence[Sequence[Outcome]], trial
         trials: Test bench with the driving system of the search.
         limit: Collisions of each search that are driven again and graded.
     """
-    from ssad.scenarios.dynamic.generate import scenario_of
-    from ssad.scenarios.dynamic.outcome import adversary_names, is_candidate
-    from ssad.simulators.closed_loop import grades_of
+    from ssad.simulators.proofs import prove_collisions
 
-    candidates = [
+    ranked = [
         (index, outcome)
         for index, (base, row) in enumerate(zip(bases, rows, strict=True))
         for outcome in ranked_collisions(row, base)[:limit]
-        if is_candidate(outcome, base.graph)
     ]
-    # another seed: a saved collision must not depend on the seed of its search
-    replays = trials.bases(
-        [
-            (scenario_of(outcome, bases[index], name="candidate"), bases[index].graph, bases[index].episode.seed + 1)
-            for index, outcome in candidates
-        ]
-    )
-    driven = [
-        (index, replay, adversary_names(outcome))
-        for (index, outcome), replay in zip(candidates, replays, strict=True)
-        if has_collision(replay)
-    ]
-    grades_of_replays = grades_of([(replay.episode, replay.trace) for _, replay, _ in driven], trials.device)
     proven = [False] * len(bases)
-    for (index, replay, names), grade in zip(driven, grades_of_replays, strict=True):
-        proven[index] |= bool(has_proof([replay], [names], [grade.metrics()]))
+    proofs = prove_collisions([(bases[index], outcome) for index, outcome in ranked], trials)
+    for (index, _), is_proven in zip(ranked, proofs, strict=True):
+        proven[index] |= is_proven
     return proven
 
 

@@ -31,9 +31,10 @@ from ssad.experiments.adversarial.found_collisions import (
     saved_collisions,
     transfer,
 )
-from ssad.experiments.adversarial.search_scores import load_reference_motions, realism_scores, summary
+from ssad.experiments.adversarial.search_scores import realism_scores, summary
 from ssad.experiments.adversarial.verdict import verdict
 from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, describe_scenarios
+from ssad.metrics.realism import traffic_reference
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.simulators.closed_loop import cached_town, grades_of, system_version
@@ -97,6 +98,7 @@ class Adversarial(ScenarioKind):
         Column("within_limits", "collisions within the adversary's limits", "", "higher", limits=SHARE),
         Column("replayed", "saved scenarios that collide again", "", "higher", limits=SHARE),
         Column("realism", "realism score of the adversaries", "", "higher", limits=SHARE),
+        Column("within_published", "adversaries within published human driving", "", "higher", limits=SHARE),
         Column("w_speed", "Wasserstein distance of speed", "m/s", "lower", limits=NOT_NEGATIVE),
         Column("w_acceleration", "Wasserstein distance of acceleration", "m/s^2", "lower", limits=NOT_NEGATIVE),
         Column("w_yaw_rate", "Wasserstein distance of yaw rate", "rad/s", "lower", limits=NOT_NEGATIVE),
@@ -203,7 +205,7 @@ class Adversarial(ScenarioKind):
                 {rollout_count: time.process_time() - start_time}
             ),
         )
-        reference_motion = load_reference_motions(job.folder, job.device)
+        reference_motion = traffic_reference()
         saved = [
             self._save(cell, base, trial_outcomes, job.folder)
             for cell, base, trial_outcomes in zip(surviving_cells, surviving_bases, outcomes, strict=True)

@@ -28,7 +28,7 @@ from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
-RANDOM, ADVERSARIES = "random", "adv-ppo"
+RANDOM, ADVERSARIES = "random", "adv-ppo-paper"
 SUMMARY = {
     "survived": "survive plain replay",
     "proven": "proven",

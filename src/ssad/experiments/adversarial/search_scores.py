@@ -1,27 +1,20 @@
-"""Results of a search for collisions: distinct collisions, and their similarity to ordinary traffic.
-
-The reference for ordinary traffic is that of SSAD's natural scenarios.
-"""
+"""Results of a search for collisions: distinct collisions, and their similarity to ordinary traffic."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.proven_collisions import MOVING
-from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein
+from ssad.core.types import F64, MOVING, AgentKind, EpisodeTrace
+from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein, within_published
 from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
 
-EPISODES: Final = 12  # of the reference
 MIN_TRAVEL: Final = 5.0  # m; who moves less is parked and says nothing
 MIN_DIFFERENCE: Final = 1.0  # m by which motions before contact differ on average, to count as distinct
 COMPARED_SECONDS: Final = 3.0  # s of motion that are compared
@@ -85,55 +78,45 @@ def _approach_positions(outcome: Outcome) -> np.ndarray[Any, Any]:
     return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], 1)
 
 
+def moving_vehicles(trace: EpisodeTrace, agents: Sequence[int]) -> list[int]:
+    """Return the vehicles among some agents that travel 5 m or more."""
+    travelled = np.hypot(np.ptp(trace.x, axis=0), np.ptp(trace.y, axis=0))
+    return [
+        agent
+        for agent in agents
+        if travelled[agent] >= MIN_TRAVEL and AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE
+    ]
+
+
 def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> list[dict[str, F64]]:
     """Return the features of the moving vehicles among some agents."""
     features = []
     query = LaneQuery(graph)
-    for agent in agents:
-        travelled = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
-        if travelled < MIN_TRAVEL or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
-            continue
+    for agent in moving_vehicles(trace, agents):
         path = np.stack([trace.x[:, agent], trace.y[:, agent]], 1).astype(np.float64)
         features.append(motion_features(trace, agent, edge_distances(query, path)))
     return features
 
 
 def realism_scores(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mapping[str, F64]) -> dict[str, float]:
-    """Realism score and distances of the adversaries that have collided with the ego; NaN if none has."""
-    features = pool_motions(
-        [
-            motion
-            for outcome in row
-            if outcome.is_valid and outcome.trace is not None
-            for motion in motions(outcome.trace, graph, outcome.adversaries)
-        ]
-    )
+    """Return realism and distances of the adversaries that have collided with the ego; NaN if none has.
+
+    Args:
+        row: Outcomes of a search.
+        graph: Lane graph of the town.
+        reference_motions: Feature -> values of ordinary traffic (`traffic_reference`).
+
+    Returns:
+        `realism` and the distances `w_...` under that traffic; `within_published`, the share of the adversaries' time
+        within published human driving.
+    """
+    traces = [(outcome.trace, outcome.adversaries) for outcome in row if outcome.is_valid and outcome.trace is not None]
+    features = pool_motions([motion for trace, agents in traces for motion in motions(trace, graph, agents)])
+    ordinary = [within_published(trace, agent) for trace, agents in traces for agent in moving_vehicles(trace, agents)]
+    steps = np.concatenate([np.zeros(0, bool), *ordinary])
     feature_distances = wasserstein(features, reference_motions)
     return {
         "realism": realism(features, reference_motions),
+        "within_published": float(steps.mean()) if len(steps) else math.nan,
         **{f"w_{name}": feature_distances[name] for name in REPORTED_FEATURES},
     }
-
-
-def load_reference_motions(folder: Path, device: str) -> dict[str, F64]:
-    """The features of the vehicles in natural scenarios driven by the Autopilot; made once for a results folder."""
-    path = folder / "reference.npz"
-    if not path.exists():
-        safeio.save_npz(path, _natural_motions(device))
-    return {name: np.asarray(values, np.float64) for name, values in safeio.load_npz(path).items()}
-
-
-@lru_cache(maxsize=1)
-def _natural_motions(device: str) -> dict[str, F64]:
-    from ssad.drivers import make_system
-    from ssad.scenarios.dynamic import load_scenarios
-    from ssad.scenarios.dynamic.generate import Trials
-    from ssad.world.roads import load_town
-
-    scenarios = load_scenarios("natural")
-    trials = Trials(lambda: make_system("autopilot"), make_system, device=device)
-    selected = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
-    features = []
-    for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in selected]):
-        features += motions(base.trace, base.graph, range(1, len(base.trace.names)))
-    return pool_motions(features)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 
+from ssad.core.wording import counted
 from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
 from ssad.metrics.driving import DIVISORS, normalise_metric
@@ -86,7 +87,8 @@ def _counts(run: DrivingRun, systems: list[str]) -> str:
                 (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
             )
         ]
-        count_texts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
+        noun = "cluster" if ranges[1] == "1" else "clusters"
+        count_texts.append(f"{system} {ranges[0]} in {ranges[1]} {noun}")
     return f"Episodes in a cell: {', '.join(count_texts)}."
 
 
@@ -127,7 +129,7 @@ def _town_weights(run: DrivingRun, towns: Mapping[str, str]) -> str:
         route_counts[town] = max(counts, default=0)
     if len(route_counts) < 2:
         return ""
-    listing = ", ".join(f"{town} {count} routes" for town, count in route_counts.items())
+    listing = ", ".join(f"{town} {counted(count, 'route')}" for town, count in route_counts.items())
     return f"The mean of the towns weighs each town the same ({listing}). "
 
 

@@ -63,7 +63,8 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
 
     Returns:
         The agents' bodies; the anchor and the unit of coordinates; the packed motion: [3 A + 1 rows of T] x, y, yaw per
-        agent, then presence (bits of 15 agents a row); the packed record of the ego; its route; and the events.
+        agent, then presence (bits of 15 agents a row); the packed record of the ego; its route; the turn signals, where
+        they change; and the events.
     """
     town_origin = origin(graph)
     anchor, scale = _anchor_and_scale(trace, town_origin)
@@ -106,6 +107,10 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         "signals": [
             _state_changes(trace.signal[:, column], int(signal)) for column, signal in enumerate(trace.signal_ids)
         ],
+        "turn_signals": [
+            [agent, _state_changes(trace.turn_signal[:, agent], agent)[1]]
+            for agent in np.flatnonzero(trace.turn_signal.any(axis=0)).tolist()
+        ],
         "end": trace.end,
     }
 
@@ -121,9 +126,9 @@ def _distance_to_nearest(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
     return clipped
 
 
-def _state_changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
-    """Return [signal, [[step, state], ...]]: only where the state changes."""
-    change_steps = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
+def _state_changes(states: npt.NDArray[np.integer[Any]], index: int) -> list[Any]:
+    """Return [index, [[step, state], ...]]: only where the state changes."""
+    change_steps = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-9))
     return [index, [[int(step), int(states[step])] for step in change_steps]]
 
 

@@ -102,7 +102,20 @@ function body(a, t) {
   else pen.roundRect(-l / 2, -w / 2, l, w, Math.min(0.5, w / 4));
   pen.fill(); pen.stroke();
   if (now.kinds[a] < KIND.walker) { pen.fillStyle = "rgba(226,232,240,.9)"; pen.fillRect(l * 0.2, -w * 0.38, l * 0.13, w * 0.76); }
+  const side = turnSignal(a, t);
+  if (side) {
+    pen.fillStyle = "#fbbf24"; const r = Math.max(0.35, 3 / view.scale);
+    for (const x of [l / 2, -l / 2]) { pen.beginPath(); pen.arc(x, side * w / 2, r, 0, 7); pen.fill(); }
+  }
   pen.restore();
+}
+
+// 1 left, -1 right, 0 none or dark: 90 flashes a minute
+function turnSignal(a, t) {
+  const entry = now.turn_signals.find(([agent]) => agent === a);
+  let state = 0;
+  if (entry) for (const [step, value] of entry[1]) if (step <= t) state = value;
+  return Math.floor(t * now.dt * 3) % 2 ? 0 : state;
 }
 
 function draw() {

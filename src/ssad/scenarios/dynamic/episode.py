@@ -122,7 +122,8 @@ def _build_one(
     if scenario.traffic:
         key = (scenario.seed, draw)
         cyclists = draw_cyclists(scenario.traffic, graph, route, other_agents, *key)
-        walkers = draw_walkers(scenario.traffic, graph, route, scenario.limits.max_time, *key)
+        standing = [ego, *other_agents, *cyclists]
+        walkers = draw_walkers(scenario.traffic, graph, route, standing, scenario.limits.max_time, *key)
         other_agents = [*other_agents, *cyclists, *walkers]
     if scenario.signals.ego == "red" and not graph.turn_on_red[0] and near_side_turns(graph, route):
         raise RouteError(

@@ -46,6 +46,7 @@ GENERATORS: dict[str, str] = {
     "near-miss": "ssad.scenarios.dynamic.logged.near_miss:NearMisses",
     "king": "ssad.scenarios.dynamic.transition.king:King",
     "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
+    "adv-ppo-paper": "ssad.scenarios.dynamic.policy.adv_ppo:PaperAdvPPO",
     "frea": "ssad.scenarios.dynamic.policy.adv_ppo:Frea",
     "adv-ddpg": "ssad.scenarios.dynamic.policy.adv_ppo:AdvDDPG",
     "cat": "ssad.scenarios.dynamic.transition.cat:Cat",

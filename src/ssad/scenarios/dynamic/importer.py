@@ -27,6 +27,7 @@ from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.import_report import ImportReport
 from ssad.core.safeio import format_location, read_json, read_xml
 from ssad.core.types import EpisodeLimits, Pose, Scenario, SignalPlan
+from ssad.core.wording import counted
 from ssad.scenarios.dynamic.catalogue import FREE_DRIVE, PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import name_part, problems
 from ssad.world.roads import load_town
@@ -419,7 +420,7 @@ def _leaderboard(folder: Path, report: ImportReport) -> tuple[Scenario, ...]:
         raise FormatError(f"{folder}: its triggers name no other actors, which their types need")
     if unmatched := len(events) - len(matched):
         report.omit("triggers that lie on no route", count=unmatched)
-    report.contents.append(f"leaderboard 1.0: {len(scenarios)} scenarios of {route_count} routes")
+    report.contents.append(f"leaderboard 1.0: {counted(len(scenarios), 'scenario')} of {counted(route_count, 'route')}")
     return tuple(scenarios)
 
 

@@ -56,12 +56,11 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         row = int(contact_rows[0])
         contact_time, ego_speed = row * float(trace.dt), abs(float(trace.speed[row, 0]))
         impact_speed = _closing_speed(trace, row, int(trace.contact_agent[row]))
-    motor_vehicles = [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.MOTORCYCLE]
+    vehicles = [agent for agent in agent_indices if trace.kind[agent] <= AgentKind.BICYCLE]
     stated_bodies = {actor.name: actor.body for actor in proposal.scenario.actors}
     models = {
         agent: model_with_body(model(trace.models[agent]), stated_bodies.get(trace.names[agent], Body()))
-        for agent in agent_indices
-        if trace.kind[agent] <= AgentKind.BICYCLE
+        for agent in vehicles
     }
     acceleration, jerk, within_limits = _peak_effort(trace, models, proposal.scenario.friction)
     return Outcome(
@@ -73,7 +72,7 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         impact_speed=impact_speed,
         ego_speed=ego_speed,
         gap=0.0 if len(contact_rows) else _min_gap(trace, agent_boxes, agent_indices),
-        off_road=any(_leaves_road(trace, graph, agent) for agent in motor_vehicles),
+        off_road=any(_leaves_road(trace, graph, agent) for agent in vehicles),
         hit_others=any(touches_others(trace, agent, boxes=agent_boxes) for agent in agent_indices),
         acceleration=acceleration,
         jerk=jerk,
@@ -107,14 +106,15 @@ def _leaves_road(trace: EpisodeTrace, graph: LaneGraph, agent: int) -> bool:
     """Return True if an agent leaves the road that is its own after having been on it.
 
     Its centre leaves the road, or comes to drive against traffic for 0.3 s or up to the end. Who has driven against
-    traffic from the start has not left anything.
+    traffic from the start has not left anything. Cyclists may leave the road, but not ride against traffic on it.
     """
     present = trace.active[:, agent]
     if not present.any():
         return False
-    off_road = _cached_lane_query(graph).off_road(np.stack([trace.x[present, agent], trace.y[present, agent]], 1))
-    if (np.diff(off_road.astype(np.int8)) > 0).any():
-        return True
+    if trace.kind[agent] <= AgentKind.MOTORCYCLE:
+        off_road = _cached_lane_query(graph).off_road(np.stack([trace.x[present, agent], trace.y[present, agent]], 1))
+        if (np.diff(off_road.astype(np.int8)) > 0).any():
+            return True
     wrong_way = wrong_way_steps(trace, graph, agent)[present]
     lawful_steps = np.flatnonzero(~wrong_way)
     if not len(lawful_steps):

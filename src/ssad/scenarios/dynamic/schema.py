@@ -15,6 +15,7 @@ import numpy as np
 from ssad.core.errors import ConfigError
 from ssad.core.safeio import Document, Location, format_location
 from ssad.core.types import (
+    MOST_ERRORS,
     Actor,
     AgentKind,
     Arrival,
@@ -299,6 +300,10 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         yield ("traffic", "minimum"), f"{traffic.minimum} is outside 0 to 64"
     if not traffic.minimum <= traffic.maximum <= 64:
         yield ("traffic", "maximum"), f"{traffic.maximum} is outside minimum ({traffic.minimum}) to 64"
+    if not 0.0 <= traffic.errors <= MOST_ERRORS:
+        yield ("traffic", "errors"), f"{traffic.errors:g} is outside 0 to {MOST_ERRORS:g} an hour"
+    if traffic.errors > 0.0 and traffic.drivers == "uniform":
+        yield ("traffic", "errors"), "only drivers of the population make errors; add drivers: population"
     for key, count in (("walkers", traffic.walkers), ("cyclists", traffic.cyclists)):
         if not 0 <= count <= 40:
             yield ("traffic", key), f"{count} is outside 0 to 40"

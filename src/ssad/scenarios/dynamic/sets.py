@@ -18,21 +18,24 @@ DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
 UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs")
 """Traffic as it comes, for rates and past stop signs; its scenarios belong to no class's own."""
+UNIFORM = ("natural-uniform",)
+"""The set `natural` of before, to which earlier results refer: uniform drivers, no walkers and no cyclists."""
 TRAINING = ("training", "training-lanes")
 """What drivers and adversaries are trained on, in towns that no other set uses; they belong to no class's own."""
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
-BUILT_IN_SETS = (*SHIPPED, *UNSELECTED, *TRAINING, *_TOWN_SETS)
+BUILT_IN_SETS = (*SHIPPED, *UNSELECTED, *UNIFORM, *TRAINING, *_TOWN_SETS)
 _SUFFIXES = (".yaml", ".yml")
 
 
 def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     """The scenarios that `ref` names, in their order.
 
-    A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, training, training-lanes, or one
-    that was imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario class (its scenarios in
-    precrash and natural, or those that a class of your own brings), a YAML file, or a folder of YAML files.
+    A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, natural-uniform, training,
+    training-lanes, or one that was imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario
+    class (its scenarios in precrash and natural, or those that a class of your own brings), a YAML file, or a folder of
+    YAML files.
     UnknownNameError shows the three closest names.
     """
     if isinstance(ref, Path) or ref.endswith(_SUFFIXES):
@@ -81,7 +84,7 @@ def _of_class(name: str) -> tuple[Scenario, ...]:
 def set_files() -> dict[str, Path]:
     """Return set name -> YAML file: the imported sets, then the shipped ones."""
     imported_files = {path.stem: path for path in sorted((home_folder() / "scenarios").glob("*.yaml"))}
-    return imported_files | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
+    return imported_files | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *UNIFORM, *TRAINING)}
 
 
 def set_names() -> tuple[str, ...]:

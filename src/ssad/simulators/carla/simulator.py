@@ -367,9 +367,16 @@ class Carla(MirroredSimulator):
         import carla
 
         agent = self._episode.agents[agent_index]
-        turn = float(control[2]) * WALKER_RATE * self.dt if controller == Controller.EXTERNAL else 0.0
-        direction = carla.Vector3D(math.cos(yaw + turn), -math.sin(yaw + turn), 0.0)
         speed = min(max(float(control[0]), 0.0), 1.0) * MODELS[agent.model].max_speed
+        if controller == Controller.EXTERNAL:
+            yaw += float(control[2]) * WALKER_RATE * self.dt
+        elif controller == Controller.SCRIPT and agent.route is not None and speed > 0.0:
+            # its way bends: towards the place where it is to be after the step
+            pose, goal = self.mirror.array("pose")[0, agent_index], self.mirror.array("script.goal")[0, agent_index]
+            forward, left = float(goal[0] - pose[0]), float(goal[1] - pose[1])
+            if 0.0 < math.hypot(forward, left) < 1.0:
+                yaw = math.atan2(left, forward)
+        direction = carla.Vector3D(math.cos(yaw), -math.sin(yaw), 0.0)
         walker = cast("carla.Walker", self._bodies[agent_index])
         walker.apply_control(carla.WalkerControl(direction=direction, speed=speed, jump=False))
 

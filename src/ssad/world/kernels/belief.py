@@ -28,6 +28,9 @@ wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
 KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
 ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
+STARTS = wp.constant(0.3)  # m/s^2
+MOST_PULL = wp.constant(2.5)  # m/s^2 that is expected to last
+MOST_START = wp.constant(6.0)  # m/s up to which it is
 CLEARING = wp.constant(3.0)  # m/s
 STRAIGHT_TURN = wp.constant(1.0e-3)  # 1/m, or rad: less is straight on
 LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expected to turn
@@ -194,6 +197,10 @@ def fill_agent_row(
     expected_speed = speed
     if follows and reliable == 1 and way[1] < body[0] - 1.0:
         expected_speed = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
+    if bank.style[e, i][0] > 0.0 and state.accel[b, i] > STARTS and speed > 0.1 and speed < MOST_START:
+        # a driver that starts is expected to gain speed: its mean speed in the time ahead
+        gain = 0.5 * STRIDE * float(HORIZON) * wp.min(state.accel[b, i], MOST_PULL)
+        expected_speed = wp.max(expected_speed, wp.min(speed + gain, MOST_START))
     box = wp.vec4(pose[0], pose[1], pose[0], pose[1])
     flat_index = (b * perceived.forecast.shape[1] + i) * HORIZON
     if wp.abs(expected_speed) > 0.1:

@@ -89,11 +89,21 @@ class SpeedProfile(IntEnum):
 
 
 class ScriptMotion(IntEnum):
-    """Way in which a script moves its agent: not at all, by steering, or exactly along its route."""
+    """Way in which a script moves its agent: not at all, by steering, exactly along its route, or as walkers walk."""
 
     NONE = 0
     STEERED = 1
     RAIL = 2
+    WALK = 3
+
+
+class WalkStatus(IntEnum):
+    """Status of a walker of natural traffic; READY waits for vehicles alone, WAITING for a signal or a gap."""
+
+    PAVEMENT = 0
+    WAITING = 1
+    READY = 2
+    CROSSING = 3
 
 
 class Presence(IntEnum):
@@ -133,6 +143,7 @@ class EpisodeArrays:
     # [E, A] driver: desired speed over the limit, jerk m/s^3, reaction time s, estimation error
     manner: wp.array2d(dtype=wp.vec4)
     habit: wp.array2d(dtype=wp.vec3)  # [E, A] driver: place left of the lane's middle m, errors an hour, key
+    courtesy: wp.array2d(dtype=wp.vec2)  # [E, A] driver: politeness (MOBIL), s that a lane change takes
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
@@ -252,6 +263,44 @@ class ScriptState:
     swerve: wp.array2d(dtype=wp.vec4)
     rail: wp.array2d(dtype=wp.vec2)  # [B, A] place m along the route and m left of it; only of agents on a rail
     goal: wp.array2d(dtype=wp.vec4)  # [B, A] x, y, yaw and speed at the end of the step; the pose only of the same
+
+
+@wp.struct
+class Walkers:
+    """Walkers of natural traffic, the crossings that they use, and where the routes of vehicles lead over these.
+
+    Legend: W crossings on walkers' ways, C crossings, G signals at crossings, V passages of routes over crossings. y is
+    the distance from a crossing's first end, towards its second one.
+    """
+
+    agents: wp.array(dtype=wp.vec2i)  # [E] first walker, and the agent after the last one
+    style: wp.array2d(dtype=wp.vec4)  # [E, A] margin s, half width of the way m, m left of its middle, m behind leader
+    depth: wp.array2d(dtype=wp.float32)  # [E, A] m from the leader of a group to the last one
+    leader: wp.array2d(dtype=wp.int32)  # [E, A] agent that decides, itself where it is alone; -1: no walker
+    stages: wp.array2d(dtype=wp.vec2i)  # [E, A] first row of `stage`, number of rows
+    stage: wp.array(dtype=wp.vec4)  # [W] m along the way to where it waits and to both kerbs, 1 (greater y) or -1
+    stage_crossing: wp.array(dtype=wp.int32)  # [W] crossing
+    crossing: wp.array(dtype=wp.vec4)  # [C] x, y of the first end, unit vector towards the second
+    form: wp.array(dtype=wp.vec4)  # [C] half width m, y of both kerbs, 1 marked
+    signals: wp.array(dtype=wp.vec2i)  # [C] first row of `signal`, number of rows
+    signal: wp.array(dtype=wp.int32)  # [G] signal of the town
+    part: wp.array(dtype=wp.vec3)  # [G] y between which its traffic passes, s that this traffic needs to come there
+    next_passing: wp.array(dtype=wp.int32)  # [N] first row of `passing` that a vehicle there has not left; -1: none
+    passing: wp.array(dtype=wp.vec3)  # [V] m along the route to both edges of the crossing, y there
+    # [V] crossing, 1 if the route turns just before, 1 if the next row is one of the same route
+    passing_crossing: wp.array(dtype=wp.vec3i)
+
+
+@wp.struct
+class WalkState:
+    """Changing state of walkers of natural traffic."""
+
+    rail: wp.array2d(dtype=wp.vec2)  # [B, A] place along its route, and left of it, m
+    stage: wp.array2d(dtype=wp.int32)  # [B, A] crossings that lie behind it
+    status: wp.array2d(dtype=wp.int32)  # [B, A] WalkStatus
+    crossing: wp.array2d(dtype=wp.int32)  # [B, A] 1 + the crossing at which it waits or that it crosses; 0: none
+    waited: wp.array2d(dtype=wp.float32)  # [B, A] s for which it has waited there
+    yielded: wp.array2d(dtype=wp.int32)  # [B, A] 1: a vehicle has yielded to it there
 
 
 @wp.struct

@@ -22,15 +22,21 @@ from ssad.world.kernels.drivers import (
     FIRM,
     HARDEST,
     NOTICES,
+    RELAXES,
     delay,
     driver_accelerates,
+    driver_power,
     is_lapsed,
     lane_place,
+    looks_at_crossing,
     pedal_change,
 )
 from ssad.world.kernels.lanes import is_changing_lane, metres_left, way_slope
-from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
+from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, lane_under, row, wrap
 
+MOVES = wp.constant(0.5)  # m/s
+BACK_STEP = wp.constant(1.0)  # m
+BEHIND = wp.constant(20.0)  # m
 HALTED = wp.constant(0.1)  # m/s
 NOTICED = wp.constant(0.5)  # m/s^2 of a change of demand that a driver has to react to
 STARTS = wp.constant(0.15)  # m/s^2: for less nobody starts
@@ -104,8 +110,12 @@ def driven_acceleration(
     pending = state.pending[b, i][0]
     # predictions flicker from step to step: a driver sees them as one
     reaction = state.pending[b, i][1]
-    reaction = reaction + NOTICES * (wp.max(state.react[b, i], -HARDEST) - reaction)
-    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), style[2] + reaction)
+    asked = wp.max(state.react[b, i], -HARDEST)
+    if asked < reaction:
+        reaction = reaction + NOTICES * (asked - reaction)
+    elif looks_at_crossing(state, b, i):
+        reaction = reaction + RELAXES * (asked - reaction)
+    demand = wp.min(driver_accelerates(speed, state.aim[b, i][1], style), driver_power(speed, style) + reaction)
     junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
     if speed < HALTED:
         if demand <= STARTS:
@@ -162,6 +172,24 @@ def room_behind(perceived: PerceivedAgents, b: int, i: int, from_row: int, to_ro
 
 
 @wp.func
+def may_back_out(
+    roads: Roads, perceived: PerceivedAgents, b: int, i: int, town: int, from_row: int, to_row: int
+) -> bool:
+    """Return whether a vehicle stays on the road if it backs out, and nobody moves in the half circle behind it."""
+    pose = perceived.pose[b, i]
+    c = wp.cos(pose[2])
+    s = wp.sin(pose[2])
+    may = lane_under(roads, town, pose[0] - BACK_STEP * c, pose[1] - BACK_STEP * s)[0] >= 0.0
+    for j in range(from_row, to_row):
+        if j != i and perceived.kind[b, j] != AgentKind.NONE and wp.abs(perceived.speed[b, j]) > MOVES:
+            dx = perceived.pose[b, j][0] - pose[0]
+            dy = perceived.pose[b, j][1] - pose[1]
+            if dx * c + dy * s < 0.0 and dx * dx + dy * dy < BEHIND * BEHIND:
+                may = bool(False)
+    return may
+
+
+@wp.func
 def drive_one(
     bank: EpisodeArrays,
     roads: Roads,
@@ -213,8 +241,8 @@ def drive_one(
             accel = wp.clamp(2.0 * (target_speed - speed), -power[1], power[0])
         throttle = wp.clamp(accel / wp.max(power[0], 0.1), 0.0, 1.0)
         brake = wp.clamp(-accel / wp.max(power[1], 0.1), 0.0, 1.0)
-        if speed < 0.2 and accel <= 0.0:
-            brake = 1.0
+        if speed < 0.2 and accel <= 0.0 and not has_driver:
+            brake = 1.0  # drivers of the population come to rest without a jolt
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
         if controller == Controller.AUTOPILOT and state.stalled[b, i] == 1 and speed < 0.3:
             from_row = int(0)
@@ -222,7 +250,9 @@ def drive_one(
             if i == 0 and perceived.believes[b] == 1:
                 from_row = agents
                 to_row = rows
-            if room_behind(perceived, b, i, from_row, to_row):
+            if room_behind(perceived, b, i, from_row, to_row) and (
+                not has_driver or may_back_out(roads, perceived, b, i, bank.town[e], from_row, to_row)
+            ):
                 throttle = 0.0
                 if speed > -1.0:
                     throttle = 0.4

@@ -9,23 +9,33 @@ section 11.3.4), and brakes no harder than the situation needs. Before a stop th
 
 import warp as wp
 
-from ssad.world.kernels.data import Roads
+from ssad.world.kernels.data import FAR, Roads, State
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
 LEADER_BRAKES = wp.constant(4.0)  # m/s^2 that a driver reckons a leader may brake with
 STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Rothery 1962: between 2.44 and 3.66)
 RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
+BEYOND_LINE = wp.constant(2.0)  # m beyond the stop line, within which who has come to rest waits for green
+STAYS_BELOW = wp.constant(1.5)  # m/s: who is slower beyond the line, stays
 SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
 FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
-HASTE = wp.constant(2.0)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
+RELEASE = wp.constant(1.8)  # times the ordinary jerk, with which the foot leaves the throttle to brake
+HASTE = wp.constant(1.5)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
 ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
 PREPARED = wp.constant(40.0)  # m before a junction from which a driver is ready to brake
 NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
+LOOKS_EVERY = wp.constant(3)  # steps after which a driver looks at crossing traffic again
+RELAXES = wp.constant(0.8)  # share of it, where a driver that looks finds that less is demanded
 HARDEST = wp.constant(9.0)  # m/s^2
 CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
-LAST_GAP = wp.constant(0.6)  # m that also a driver who is late keeps to where it stops
+LAST_GAP = wp.constant(1.0)  # m that also a driver who is late keeps to where it stops
+LAUNCH = wp.constant(0.6)  # share by which the acceleration from rest is larger
+LAUNCHED = wp.constant(8.0)  # m/s from which on it is the ordinary one
+EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which a driver begins to brake early
+LONGEST_WAIT = wp.constant(20.0)  # s
+PASS_GAP = wp.constant(1.0)  # m that a driver is before a conflict when the other one has left it
 YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
 YIELD_LEAST = wp.constant(0.4)  # m before it at which a driver stops who is late
 SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
@@ -38,18 +48,43 @@ WANDER = wp.constant(0.05)  # m of it
 
 
 @wp.func
+def looks_at_crossing(state: State, b: int, i: int) -> bool:
+    """Return whether a driver looks at crossing traffic in this step: every `LOOKS_EVERY` steps, not all at once."""
+    return (state.step[b] + i) % LOOKS_EVERY == 0
+
+
+@wp.func
+def driver_power(own_speed: float, style: wp.vec4) -> float:
+    """Return the acceleration that the driver wants on a free road, m/s^2: stronger from rest than while following.
+
+    Source: the falling acceleration of starts, Long (2000), Transportation Research Record 1737.
+    """
+    return style[2] * (1.0 + LAUNCH * wp.clamp(1.0 - own_speed / LAUNCHED, 0.0, 1.0))
+
+
+@wp.func
+def follow_need(own_speed: float, leader_speed: float, room: float) -> float:
+    """Return the deceleration that keeps a driver from using up its room, also if its leader brakes."""
+    slower = wp.max(own_speed - leader_speed, 0.0)
+    least_room = wp.max(room, 0.2)
+    return wp.max(
+        slower * slower / (2.0 * least_room),
+        own_speed * own_speed / (2.0 * (least_room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
+    )
+
+
+@wp.func
 def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a leader `gap` metres ahead that drives at `leader_speed` m/s."""
     closing = own_speed * (own_speed - leader_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, own_speed * style[0] + closing)) / wp.max(gap, 0.1)
-    wish = style[2] * (1.0 - ratio * ratio)
-    room = wp.max(gap - LAST_GAP, 0.2)
-    slower = wp.max(own_speed - leader_speed, 0.0)
-    need = wp.max(
-        slower * slower / (2.0 * room),
-        own_speed * own_speed / (2.0 * (room + leader_speed * leader_speed / (2.0 * LEADER_BRAKES))),
-    )
-    return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - style[2]
+    power = driver_power(own_speed, style)
+    wish = power * (1.0 - ratio * ratio)
+    need = follow_need(own_speed, leader_speed, gap - 0.8 * style[1])
+    if need > FIRM:
+        # who is late stops nearer to the leader
+        need = wp.max(FIRM, follow_need(own_speed, leader_speed, gap - LAST_GAP))
+    return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - power
 
 
 @wp.func
@@ -61,15 +96,29 @@ def driver_stops(own_speed: float, distance: float, style: wp.vec4) -> float:
     room = wp.max(distance - 0.8 * style[1], 0.3)
     need = own_speed * own_speed / (2.0 * room)
     share = need / style[3]
-    allowed = style[2] - (style[2] + style[3]) * share * share
+    power = driver_power(own_speed, style)
+    allowed = power - (power + style[3]) * share * share
     if share > 1.0:
         # who is late stops nearer to the place
         late = own_speed * own_speed / (2.0 * wp.max(distance - LAST_GAP, 0.3))
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if distance < style[1]:
         ratio = style[1] / wp.max(distance, 0.1)
-        allowed = wp.min(allowed, wp.max(style[2] * (1.0 - ratio * ratio), -style[3]))
-    return allowed - style[2]
+        allowed = wp.min(allowed, wp.max(power * (1.0 - ratio * ratio), -style[3]))
+    return allowed - power
+
+
+@wp.func
+def early_distance(distance: float, own_speed: float, accel: float, jerk: float, style: wp.vec4) -> float:
+    """Return the distance to a stop less what the driver covers until it brakes comfortably, at least half of it."""
+    lag = 0.5 * wp.max(accel + style[3], 0.0) / jerk
+    return wp.max(distance - own_speed * lag, 0.5 * distance)
+
+
+@wp.func
+def early_react(react: float, early: float, own_speed: float, style: wp.vec4) -> float:
+    """Return the reaction `early` to an earlier place, at most `EARLY` strong where `react` to the place asks less."""
+    return wp.max(early, wp.min(react, -EARLY * style[3] - driver_power(own_speed, style)))
 
 
 @wp.func
@@ -77,15 +126,32 @@ def driver_yields(own_speed: float, gap: float, style: wp.vec4) -> float:
     """Return the reaction to a conflict `gap` metres ahead of the front; its margins are room to stop in."""
     need = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_GAP, 0.3))
     share = need / style[3]
-    allowed = style[2] - (style[2] + style[3]) * share * share
+    power = driver_power(own_speed, style)
+    allowed = power - (power + style[3]) * share
     if share > 1.0:
         late = own_speed * own_speed / (2.0 * wp.max(gap - YIELD_LEAST, 0.3))
         if own_speed < CREEPS:
             late = wp.min(late, FIRM)  # half a metre less is no matter at such a speed
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if gap < YIELD_GAP + 0.5:
-        allowed = wp.min(allowed, -0.2 * style[3])
-    return allowed - style[2]
+        # the nearer, the firmer it holds
+        allowed = wp.min(allowed, -(0.8 - 0.6 * gap / (YIELD_GAP + 0.5)) * style[3])
+    return allowed - power
+
+
+@wp.func
+def driver_arrives_after(own_speed: float, gap: float, time: float, style: wp.vec4) -> float:
+    """Return the reaction with which the front is at a place `gap` metres ahead in `time` s, not at rest.
+
+    -FAR where it would have to stop before.
+    """
+    react = -FAR
+    room = gap - PASS_GAP
+    if room > 0.5 * own_speed * time and time < LONGEST_WAIT:
+        react = wp.min(
+            2.0 * (room - own_speed * time) / wp.max(time * time, 0.01) - driver_power(own_speed, style), 0.0
+        )
+    return react
 
 
 @wp.func
@@ -108,7 +174,7 @@ def driver_accelerates(own_speed: float, target: float, style: wp.vec4) -> float
     if own_speed > target:
         return wp.max(-1.5 * (own_speed - target), -style[3])
     ratio = own_speed / wp.max(target, 0.1)
-    return style[2] * (1.0 - ratio * ratio * ratio * ratio)
+    return driver_power(own_speed, style) * (1.0 - ratio * ratio * ratio * ratio)
 
 
 @wp.func
@@ -165,4 +231,6 @@ def delay(reaction_time: float, speed: float, junction: float) -> float:
 def pedal_change(demand: float, accel: float, jerk: float, time_step: float) -> float:
     """Return the acceleration to which a driver comes in a step, from `accel` towards `demand`."""
     down = jerk * wp.clamp(-demand / HASTE, 1.0, 6.0)
+    if accel > 0.0 and demand < 0.0:
+        down = wp.max(down, RELEASE * jerk)
     return wp.clamp(demand, accel - down * time_step, accel + jerk * time_step)

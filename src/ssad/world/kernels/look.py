@@ -1,13 +1,15 @@
-"""Observations of learned drivers: SafeBench's four numbers, FREA's 4 x 6 rows, and a view from above."""
+"""Observations of learned drivers: SafeBench's four numbers, FREA's 4 x 6 rows, the road around, a view from above."""
 
 import warp as wp
 
 from ssad.core.types import AgentKind
 from ssad.world.kernels.data import EpisodeArrays, Presence, Roads, State
-from ssad.world.kernels.shared import lane_under, route_at, wrap
+from ssad.world.kernels.shared import lane_under, route_at, row, wrap
 
 OBSERVATION = 28  # numbers in a row of `look`
 CHANNELS = 4  # of `look_from_above`
+ROAD = 21  # numbers in a row of `look_at_road`: under the centre, and at 4 x 5 points ahead
+OFF_ROAD = wp.constant(-2.0)  # alignment of a point on no lane
 GOAL_AHEAD = wp.constant(6.5)  # m along the ego's route from its centre to the adversary's goal
 GOAL_RADIUS = wp.constant(2.0)  # m
 
@@ -215,6 +217,72 @@ def look_as_adversary(
     )
 
 
+@wp.func
+def alignment_at(roads: Roads, town: int, x: float, y: float, c: float, s: float) -> float:
+    """Return the largest cosine between a course (c, s) and the lanes under a point; OFF_ROAD where there is none."""
+    grid = roads.grid[town]
+    size = roads.grid_size[town]
+    column = int(wp.floor((x - grid[0]) * grid[2]))
+    line = int(wp.floor((y - grid[1]) * grid[2]))
+    best = float(OFF_ROAD)
+    if column < 0 or line < 0 or column >= size[0] or line >= size[1]:
+        return best
+    cell = size[2] + line * size[0] + column
+    for entry in range(roads.cell_first[cell], roads.cell_first[cell + 1]):
+        segment = roads.cell_segment[entry]
+        ends = row(roads.segment, segment)
+        dx = ends[2] - ends[0]
+        dy = ends[3] - ends[1]
+        px = x - ends[0]
+        py = y - ends[1]
+        squared_length = wp.max(dx * dx + dy * dy, 1.0e-9)
+        share = wp.clamp((px * dx + py * dy) / squared_length, 0.0, 1.0)
+        away_x = px - share * dx
+        away_y = py - share * dy
+        half = roads.segment_half[segment]
+        half_width = half[0] + share * (half[1] - half[0])
+        if away_x * away_x + away_y * away_y <= half_width * half_width:
+            best = wp.max(best, (dx * c + dy * s) / wp.sqrt(squared_length))
+    return best
+
+
+@wp.kernel(enable_backward=False)
+def look_at_road(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    agents: int,
+    observers: wp.array(dtype=wp.vec2i),
+    out: wp.array2d(dtype=wp.float32),
+):
+    """Write how well the road fits the course of each observer [N, 21].
+
+    First the cosine between its course and the lane under its centre that fits best, -2 off the road. Its course is
+    that of its motion: it turns round in reverse. Then the same for points 0, 5, 10 and 20 m ahead, each 4 and 2 m to
+    the left, in the middle, and 2 and 4 m to the right, with its heading as course and -1 off the road.
+    """
+    n = wp.tid()
+    b = observers[n][0]
+    i = observers[n][1]
+    town = bank.town[state.episode[b]]
+    pose = state.pose[b, i]
+    c = wp.cos(pose[2])
+    s = wp.sin(pose[2])
+    motion = float(1.0)
+    if state.speed[b, i] < 0.0:
+        motion = -1.0
+    out[n, 0] = alignment_at(roads, town, pose[0], pose[1], motion * c, motion * s)
+    for station in range(4):
+        ahead = 5.0 * float(station)
+        if station == 3:
+            ahead = 20.0
+        for place in range(5):
+            left = 4.0 - 2.0 * float(place)
+            x = pose[0] + ahead * c - left * s
+            y = pose[1] + ahead * s + left * c
+            out[n, 1 + 5 * station + place] = wp.max(alignment_at(roads, town, x, y, c, s), -1.0)
+
+
 @wp.kernel(enable_backward=False)
 def look_from_above(
     bank: EpisodeArrays,
@@ -231,12 +299,12 @@ def look_from_above(
 
     metre: pixels a metre; behind: metres that are seen behind the agent's centre. Where it itself is, agents is 0.5.
     """
-    n, row, column = wp.tid()
+    n, line, column = wp.tid()
     b = observers[n][0]
     i = observers[n][1]
     e = state.episode[b]
     pose = state.pose[b, i]
-    ahead = (float(side) - 0.5 - float(row)) / metre - behind
+    ahead = (float(side) - 0.5 - float(line)) / metre - behind
     left = (0.5 * float(side) - 0.5 - float(column)) / metre
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
@@ -245,7 +313,7 @@ def look_from_above(
     road = float(0.0)
     if lane_under(roads, bank.town[e], x, y)[0] >= 0.0:
         road = 1.0
-    out[n, 0, row, column] = road
+    out[n, 0, line, column] = road
     path = float(0.0)
     route = bank.route[e, i]
     if route[1] > 1:
@@ -255,7 +323,7 @@ def look_from_above(
             point = roads.path[route[0] + index]
             if (point[0] - x) * (point[0] - x) + (point[1] - y) * (point[1] - y) < 1.0:
                 path = 1.0
-    out[n, 1, row, column] = path
+    out[n, 1, line, column] = path
     occupied = float(0.0)
     speed = float(0.0)
     for j in range(agents):
@@ -274,5 +342,5 @@ def look_from_above(
                 occupied = 1.0
                 if j == i:
                     occupied = 0.5
-    out[n, 2, row, column] = occupied
-    out[n, 3, row, column] = speed
+    out[n, 2, line, column] = occupied
+    out[n, 3, line, column] = speed

@@ -139,7 +139,7 @@ def move_one(
         if rows[3] != ScriptMotion.NONE and state.active[b, i] == Presence.AWAKE:
             is_scripted = 1
             target_place = script.goal[b, i]
-            is_placed = rows[3] == ScriptMotion.RAIL
+            is_placed = rows[3] >= ScriptMotion.RAIL
     if is_placed:
         if controller == Controller.PLACED:
             target_place = place[b, i]

@@ -13,8 +13,6 @@ from ssad.world.kernels.data import (
     FAR,
     LEADERS,
     NO_LEADER,
-    REGISTERS,
-    End,
     EpisodeArrays,
     PerceivedAgents,
     Presence,
@@ -40,7 +38,7 @@ CLOSED_UP = wp.constant(0.1)  # m/s from the speed of its leader: who follows it
 STEADY = wp.constant(0.1)  # m/s^2 of whom nothing but its leader holds up
 APART = wp.constant(25.0)  # m between two who stand that are too few to come back between them
 
-vec5 = wp.types.vector(length=5, dtype=wp.float32)
+vec7 = wp.types.vector(length=7, dtype=wp.float32)
 
 
 @wp.func
@@ -81,12 +79,13 @@ def examine_lane(
     v: float,
     horizon: float,
     goal: float,
-) -> vec5:
+) -> vec7:
     """Examine a lane `share` lanes left of i's route: whether i can go there.
 
     horizon: s that i would be there, goal: metres it would have travelled by then.
     Returns: gap in front m (FAR: none), speed of the agent there, braking of the hardest-hit agent behind,
-    whether i would touch an agent (1.0), whether an agent comes too near by then (1.0).
+    whether i would touch an agent (1.0), whether an agent comes too near by then (1.0), gap to the nearest agent behind
+    m (FAR: none), its speed.
     """
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
@@ -96,6 +95,8 @@ def examine_lane(
     front_gap = FAR
     front_speed = float(0.0)
     braking_behind = float(0.0)
+    rear_gap = FAR
+    rear_speed = float(0.0)
     blocked = float(0.0)
     oncoming = float(0.0)
     lane_shift = wp.vec4(0.0, 1.0, share, share)
@@ -145,11 +146,14 @@ def examine_lane(
                     elif gap_behind > 0.0:
                         if other_speed > 0.0:
                             braking_behind = wp.min(braking_behind, idm_gap(other_speed, wp.max(v, 0.0), gap_behind))
+                        if gap_behind < rear_gap:
+                            rear_gap = gap_behind
+                            rear_speed = wp.max(other_speed, 0.0)
                         if gap_behind < 1.0:
                             blocked = 1.0
                     else:
                         blocked = 1.0
-    return vec5(front_gap, front_speed, braking_behind, blocked, oncoming)
+    return vec7(front_gap, front_speed, braking_behind, blocked, oncoming, rear_gap, rear_speed)
 
 
 @wp.func
@@ -431,21 +435,3 @@ def choose_lane(
     if stands and wants and not decided:
         reaction = stop_before(speed, wp.max(gap - PULL_OUT, 0.1), bank.style[e, i])
         state.react[b, i] = wp.min(state.react[b, i], reaction)
-
-
-@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
-def change_lanes(
-    bank: EpisodeArrays,
-    roads: Roads,
-    state: State,
-    perceived: PerceivedAgents,
-    work: Work,
-    agents: int,
-    all_rows: int,
-    threads: int,
-):
-    """Let every Autopilot begin a needed lane change where it is safe."""
-    b, first = wp.tid()
-    if state.end[b] == End.RUNNING:
-        for i in range(first, agents, threads):
-            choose_lane(bank, roads, state, perceived, work, b, i, agents, all_rows)

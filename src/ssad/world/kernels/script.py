@@ -592,10 +592,10 @@ def begin_all(
         if scripts.ring[condition][1] > 0 or scripts.condition[condition][0] == PhaseCondition.STANDSTILL:
             remember(bank, roads, scripts, state, script, scene_index, condition, dt)
     for agent_index in range(agents):
-        if (
-            bank.script[episode, agent_index][3] != ScriptMotion.NONE
-            and state.active[scene_index, agent_index] == Presence.AWAKE
-        ):
+        kind = bank.script[episode, agent_index][3]
+        if (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL) and state.active[
+            scene_index, agent_index
+        ] == Presence.AWAKE:
             if begin_phases(bank, roads, scripts, state, script, scene_index, agent_index, dt) == 1:
                 begins = 1
     return begins
@@ -1036,10 +1036,10 @@ def run_scripts(
         while begins == 1:
             begins = begin_all(bank, roads, scripts, state, script, scene_index, agents, dt)
     for agent_index in range(agents):
-        if (
-            bank.script[episode, agent_index][3] != ScriptMotion.NONE
-            and state.active[scene_index, agent_index] == Presence.AWAKE
-        ):
+        kind = bank.script[episode, agent_index][3]
+        if (kind == ScriptMotion.STEERED or kind == ScriptMotion.RAIL) and state.active[
+            scene_index, agent_index
+        ] == Presence.AWAKE:
             run_one(bank, roads, scripts, state, script, scene_index, agent_index, dt)
 
 

@@ -21,25 +21,39 @@ from ssad.world.kernels.data import (
     PerceivedAgents,
     Presence,
     Roads,
+    ScriptMotion,
     State,
     TurnRank,
     Work,
 )
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
+    BEYOND_LINE,
     CREEPS,
     FIRM,
     RUNS_RED,
+    STAYS_BELOW,
     STOPS_AT_YELLOW,
     YIELD_LEAST,
+    driver_arrives_after,
     driver_follows,
+    driver_power,
     driver_speed,
     driver_stops,
     driver_yields,
+    early_distance,
+    early_react,
     is_lapsed,
     judged_share,
+    looks_at_crossing,
 )
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
+from ssad.world.kernels.meeting import (
+    ALIGNED,
+    Meeting,
+    find_meeting,
+    forecast_pose,
+)
 from ssad.world.kernels.shared import (
     BRIDGE,
     IDM_ACCEL,
@@ -62,19 +76,42 @@ SIGHT_SHARE = wp.constant(0.2)  # s^2/m: distance of a stop at 2.5 m/s^2, per sq
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
+JAMMED = wp.constant(45.0)  # s after which a driver makes room behind somebody who stands in a junction
+CLOSED_UP = wp.constant(3.0)  # m
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
+PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
+SOON_THERE = wp.constant(5.0)  # s until then
+LETS_BELOW = wp.constant(1.5)  # m/s of a driver that starts
+TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
+WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
+BACKS_TIME = wp.constant(2.0)  # s for which a driver expects somebody to go on backwards
+PARALLEL = wp.constant(0.9)  # cosine of two headings
+STOPS_THERE = wp.constant(0.5)  # m/s^2
+STARTS = wp.constant(0.3)  # m/s^2 of it
 LONGER = wp.constant(6)  # strides beyond the forecast
-RELIES = wp.constant(4.5)  # m/s^2 with which a driver relies on others to brake for it
-MARGIN = wp.constant(2)  # strides between a driver that gives way and who comes after it
-MOST_MARGIN = wp.constant(12)  # strides of it at most, with what the other may gain
+RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
+MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
+UNSURE = wp.constant(0.06)  # s/m: the further away, the more of it
+LEAST_MARGIN = wp.constant(0.3)  # s of it, of who has priority
+AFTERWARDS = wp.constant(0.3)  # s between somebody who was let pass and the driver
+COVERED = wp.constant(0.05)  # s: sooner, the other one is in the way already
+CROSSES = wp.constant(1.0)  # m/s of somebody in the way who is going to leave it
+STARTS_BELOW = wp.constant(0.3)  # m/s
+START_TIME = wp.constant(0.7)  # s that a start from rest takes longer: reaction, and jerk
+PICKS_UP_SHARE = wp.constant(0.8)  # of its acceleration, that a driver reckons with
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
-STILL_STOPS = wp.constant(5.0)  # m/s^2 of who brakes for the conflict already
+STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in the way of who passes
+JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
+ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
 TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+HOLDS = wp.constant(0.3)  # share of its acceleration, and m/s^2
+DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a driver that relies on somebody waits
+WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
-COMMITTED = wp.constant(3.0)  # m/s^2: who would have to brake harder before a conflict goes on
+AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
 
@@ -110,6 +147,17 @@ def stop_before(v: float, gap: float, style: wp.vec4) -> float:
     if style[0] > 0.0:
         return driver_stops(v, gap, style)
     return idm_gap(v, 0.0, gap)
+
+
+@wp.func
+def stops_early(bank: EpisodeArrays, state: State, b: int, i: int, e: int, speed: float, distance: float) -> float:
+    """Return the reaction to a place before which an agent stops, early enough for the jerk of its driver."""
+    style = bank.style[e, i]
+    react = stop_before(speed, distance, style)
+    if style[0] > 0.0:
+        early = early_distance(distance, speed, state.accel[b, i], bank.manner[e, i][1], style)
+        react = early_react(react, stop_before(speed, early, style), speed, style)
+    return react
 
 
 @wp.func
@@ -283,6 +331,19 @@ def arrives_first(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j:
 
 
 @wp.func
+def crosses_first(perceived: PerceivedAgents, b: int, i: int, j: int) -> bool:
+    """Return whether i is first at the crossing of their straight paths; an agent that brakes for j stays second."""
+    own_pose = perceived.pose[b, i]
+    other_pose = perceived.pose[b, j]
+    sine = wp.sin(other_pose[2] - own_pose[2])
+    dx = other_pose[0] - own_pose[0]
+    dy = other_pose[1] - own_pose[1]
+    far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
+    far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
+    return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+
+
+@wp.func
 def has_priority(
     bank: EpisodeArrays,
     roads: Roads,
@@ -320,17 +381,8 @@ def has_priority(
         return own_way[2] < other_way[2]
     if wp.abs(own_way[1] - other_way[1]) > 1.0:
         return own_way[1] < other_way[1]
-    if inside_i and inside_j:
-        own_pose = perceived.pose[b, i]
-        other_pose = perceived.pose[b, j]
-        sine = wp.sin(other_pose[2] - own_pose[2])
-        if wp.abs(sine) > 0.5:
-            # First at the crossing of their straight paths; an agent that brakes for the other stays second.
-            dx = other_pose[0] - own_pose[0]
-            dy = other_pose[1] - own_pose[1]
-            far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
-            far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
-            return arrives_first(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
+    if inside_i and inside_j and wp.abs(wp.sin(perceived.pose[b, j][2] - perceived.pose[b, i][2])) > 0.5:
+        return crosses_first(perceived, b, i, j)
     return i < j
 
 
@@ -343,65 +395,9 @@ def looks_longer(rule: wp.vec4, offset: float, half: float, speed: float, style:
     reach = float(APPROACH)
     if int(rule[3]) >= int(TurnRank.YIELD):
         reach = 2.0 * APPROACH
-    if style[0] > 0.0 and rule[2] > 0.0 and front < reach and crosses:
+    if style[0] > 0.0 and front < reach and crosses:
         extra = LONGER
     return extra
-
-
-@wp.func
-def forecast_pose(perceived: PerceivedAgents, b: int, j: int, index: int) -> wp.vec3:
-    """Return the pose of an agent `index` + 1 strides ahead; beyond its forecast it goes straight on."""
-    if index < HORIZON:
-        return perceived.forecast[b, j, index]
-    last = perceived.forecast[b, j, HORIZON - 1]
-    previous = perceived.forecast[b, j, HORIZON - 2]
-    strides = float(index - HORIZON + 1)
-    return wp.vec3(last[0] + strides * (last[0] - previous[0]), last[1] + strides * (last[1] - previous[1]), last[2])
-
-
-@wp.func
-def corridor_edge(
-    roads: Roads,
-    perceived: PerceivedAgents,
-    b: int,
-    j: int,
-    route: wp.vec2i,
-    shift: wp.vec4,
-    u0: float,
-    own_half: wp.vec2,
-    other_half: wp.vec2,
-    places: wp.vec2i,
-    limit: float,
-) -> float:
-    """Return the metres up to `limit` that i can go on without a body in the stretch that j is about to drive through.
-
-    places: first and last index of j's forecast; -1 is its place now.
-    """
-    edge = limit
-    for metre in range(int(limit) + 1):
-        frame = way_frame(roads, route[0], route[1], shift, u0 + float(metre))
-        touches = bool(False)
-        for place in range(places[0], places[1] + 1):
-            other_pose = perceived.pose[b, j]
-            if place >= 0:
-                other_pose = forecast_pose(perceived, b, j, place)
-            if frames_touch(
-                other_pose[0] - frame[0],
-                other_pose[1] - frame[1],
-                frame[2],
-                frame[3],
-                own_half[0],
-                own_half[1],
-                wp.cos(other_pose[2]),
-                wp.sin(other_pose[2]),
-                other_half[0],
-                other_half[1],
-            ):
-                touches = bool(True)
-        if touches:
-            edge = wp.max(float(metre) - 1.0, 0.0)
-            break
-    return edge
 
 
 @wp.func
@@ -418,28 +414,14 @@ def conflict_gap(
     own_body: wp.vec4,
     other_body: wp.vec2,
     lat_margin: float,
-    pace: float,
-    pick_up: float,
-    extra: int,
-    margin_strides: int,
-    other_accel: float,
-) -> wp.vec3:
-    """Return the distance from i's front bumper to its predicted conflict with j, or FAR, and the time until then, s.
-
-    The third number is the distance to a conflict with j half a second or more after i; it counts only where
-    `margin_strides` > 0, and then the first one leaves it out.
+) -> float:
+    """Return the distance from i's front bumper to its predicted conflict with j, or FAR.
 
     i is predicted along its intention, j along its own route at constant speed (along its heading if it has none);
     they are compared at the same time and half a second to either side. The distance is to the near edge of the
-    conflict. Who gives way asks for `margin_strides` more between itself and j, which may go on to gain speed at
-    `other_accel` m/s^2.
+    conflict. Drivers of the population look closer: `meeting`.
     """
     gap = FAR
-    late_gap = FAR
-    first_place = int(HORIZON) + 99
-    last_place = int(-1)
-    other_speed = wp.max(wp.abs(perceived.speed[b, j]), 1.0)
-    first_time = FAR
     along = float(0.0)
     speed = v
     # Long enough that a fast, short agent does not skip from before the path to behind it.
@@ -448,33 +430,25 @@ def conflict_gap(
     squared_reach = reach * reach
     before = perceived.pose[b, j]
     now = perceived.forecast[b, j, 0]
-    strides = int(HORIZON) + extra
-    for step in range(strides):
+    for step in range(HORIZON):
         # it slows down for bends as the route's speed profile says
         route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
         next_speed = wp.min(
-            speed + pick_up * STRIDE,
-            wp.min(wp.max(target, speed), wp.max(pace * roads.rule[route_point][0], speed - 4.0 * STRIDE)),
+            speed + PICKS_UP * STRIDE,
+            wp.min(wp.max(target, speed), wp.max(roads.rule[route_point][0], speed - 4.0 * STRIDE)),
         )
         along = along + 0.5 * (speed + next_speed) * STRIDE
         speed = next_speed
         frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         later = now
-        if step + 1 < strides:
-            later = forecast_pose(perceived, b, j, step + 1)
-        moments = int(3)
-        if margin_strides > 0:
-            time = STRIDE * float(step + 1)
-            gained = 0.5 * other_accel * time * time / (other_speed * STRIDE)
-            moments = 3 + wp.min(margin_strides + int(gained + 0.5), MOST_MARGIN)
-        for moment in range(moments):
+        if step + 1 < HORIZON:
+            later = perceived.forecast[b, j, step + 1]
+        for moment in range(3):
             other_pose = now
             if moment == 0:
                 other_pose = before
             elif moment == 2:
                 other_pose = later
-            elif moment > 2:
-                other_pose = forecast_pose(perceived, b, j, step - 1 + moment)
             rel_x = other_pose[0] - frame[0]
             rel_y = other_pose[1] - frame[1]
             if rel_x * rel_x + rel_y * rel_y < squared_reach:
@@ -493,35 +467,19 @@ def conflict_gap(
                     edge = along + longitudinal - half_along - own_body[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
-                        first_place = wp.min(first_place, step - 1 + moment)
-                        last_place = wp.max(last_place, step - 1 + moment)
-                        if margin_strides > 0 and moment > 1:
-                            late_gap = wp.min(late_gap, wp.max(edge, 0.0))
-                        else:
-                            gap = wp.min(gap, wp.max(edge, 0.0))
-                        first_time = wp.min(first_time, STRIDE * float(step))
+                        gap = wp.min(gap, wp.max(edge, 0.0))
         before = now
         now = later
-    nearest = wp.min(gap, late_gap)
-    if margin_strides > 0 and nearest < FAR:
-        edge = corridor_edge(
-            roads,
-            perceived,
-            b,
-            j,
-            route,
-            shift,
-            u0,
-            wp.vec2(own_body[0], own_body[1] + lat_margin),
-            wp.vec2(half_length, other_body[1]),
-            wp.vec2i(wp.max(first_place - 1, -1), last_place + 1),
-            nearest,
-        )
-        if gap < FAR:
-            gap = wp.min(gap, edge)
-        if late_gap < FAR:
-            late_gap = wp.min(late_gap, edge)
-    return wp.vec3(gap, first_time, late_gap)
+    return gap
+
+
+@wp.func
+def is_natural_walker(bank: EpisodeArrays, e: int, j: int) -> bool:
+    """Return whether a row of `PerceivedAgents` is a walker of natural traffic, for which `walkers` has the rules."""
+    natural = bool(False)
+    if j < bank.script.shape[1]:
+        natural = bank.script[e, j][3] == ScriptMotion.WALK
+    return natural
 
 
 @wp.func
@@ -603,10 +561,13 @@ def scan_agents(
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
-            react = stop_before(speed, line_gap + 1.0, style)
+            react = stops_early(bank, state, b, i, e, speed, line_gap + 1.0)
     if signal_index >= 0:
         line_gap = road_rule[1] - offset - own_body[0]
-        if line_gap > -0.5 and line_gap < sight + 20.0:
+        passed = float(-0.5)
+        if style[0] > 0.0 and signal_now == SignalState.RED and speed < STAYS_BELOW:
+            passed = -BEYOND_LINE
+        if line_gap > passed and line_gap < sight + 20.0:
             stop = signal_now == SignalState.RED
             if signal_now == SignalState.YELLOW:
                 stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
@@ -622,7 +583,7 @@ def scan_agents(
             ):
                 stop = False  # turn to the near side on red, after a stop, where allowed; it yields below
             if stop:
-                react = wp.min(react, stop_before(speed, line_gap + 1.0, style))
+                react = wp.min(react, stops_early(bank, state, b, i, e, speed, line_gap + 1.0))
     state.react[b, i] = react
     state.stalled[b, i] = 0
     work.leader[b, i] = NO_LEADER
@@ -656,11 +617,16 @@ def scan_agents(
     if i == 0 and perceived.believes[b] == 1:
         from_row = agents
         to_row = rows
+    # a driver of the population looks at crossing traffic in some steps only, and keeps in mind what it saw
+    looks_aside = style[0] == 0.0 or looks_at_crossing(state, b, i)
     for j in range(from_row, to_row):
-        if j != i and perceived.kind[b, j] != AgentKind.NONE:
+        if j != i and perceived.kind[b, j] != AgentKind.NONE and not is_natural_walker(bank, e, j):
             box = perceived.span[b, j]
+            if not looks_aside:
+                here = perceived.pose[b, j]
+                box = wp.vec4(here[0], here[1], here[0], here[1])
             last_pose = perceived.forecast[b, j, HORIZON - 1]
-            if extra > 0:
+            if looks_aside and extra > 0:
                 last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
                 box = extend_box(box, last_pose)
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
@@ -683,8 +649,10 @@ def scan_agents(
                 )
                 if in_box and longitudinal > -bend - own_body[0] and wp.abs(lateral) < bend + half_width:
                     flags = 1
-                if wp.abs(perceived.speed[b, j]) > 0.2 and (
-                    longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width
+                if (
+                    looks_aside
+                    and wp.abs(perceived.speed[b, j]) > 0.2
+                    and (longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width)
                 ):
                     # An agent behind in the same lane and direction keeps its distance itself.
                     bend_j = perceived.way[b, j][3]
@@ -700,6 +668,186 @@ def scan_agents(
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
                     work.pair[slot] = ((b * agents + i) * rows + j) * 4 + flags
+
+
+@wp.func
+def waits_at_line(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    j: int,
+    e: int,
+    goes_first: bool,
+    line: float,
+    dt: float,
+) -> bool:
+    """Return whether i waits for j before the junction and not in it, as all do but who turns left on green.
+
+    line: metres from its front to where it would wait.
+    """
+    speed = wp.max(state.speed[b, i], 0.0)
+    waits = bool(False)
+    if (
+        not goes_first
+        and line > -1.0
+        and perceived.kind[b, j] != AgentKind.WALKER
+        and speed * speed < 8.0 * (line + 1.5)
+    ):
+        first = bank.route[e, i][0] + state.progress[b, i]
+        index = roads.path_signal[first]
+        signal_now = int(SignalState.OFF)
+        if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
+            signal_now = light(bank, roads, state, perceived, b, i, e, index, dt)
+        entered = is_in_junction(perceived, b, j)
+        crosses = wp.abs(wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2])) < 0.7
+        waits = signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses
+    return waits
+
+
+@wp.func
+def meet_driver(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    b: int,
+    i: int,
+    j: int,
+    e: int,
+    agents: int,
+    lon: float,
+    margin: float,
+    goes_first: bool,
+) -> Meeting:
+    """Return where a driver of the population would meet an agent if it went on as it likes; see `find_meeting`."""
+    style = bank.style[e, i]
+    route = bank.route[e, i]
+    own_body = bank.body[bank.model[e, i]]
+    speed = wp.max(state.speed[b, i], 0.0)
+    place = state.progress[b, i]
+    aim = state.aim[b, i]
+    soon = route[0] + wp.min(place + AHEAD, route[1] - 1)
+    start = float(0.0)
+    if speed < STARTS_BELOW:
+        start = START_TIME
+    top_speed = wp.min(aim[1], bank.manner[e, i][0] * roads.rule[soon][0])
+    motion = wp.vec4(speed, PICKS_UP_SHARE * driver_power(speed, style), top_speed, start)
+    rule = row(roads.rule, route[0] + place)
+    extra = looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
+    before = wp.vec2(LEAST_MARGIN, 0.0)
+    other_accel = float(0.0)
+    if j < agents:
+        other_accel = state.accel[b, j]
+    if not goes_first:
+        before = wp.vec2(MARGIN, UNSURE)
+    return find_meeting(
+        roads,
+        perceived,
+        b,
+        j,
+        route,
+        state.shift[b, i],
+        aim[0],
+        lon,
+        motion,
+        own_body,
+        perceived.half[b, j],
+        margin,
+        before,
+        other_accel,
+        HORIZON + extra,
+    )
+
+
+@wp.func
+def driver_gives_way(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    perceived: PerceivedAgents,
+    meeting: Meeting,
+    b: int,
+    i: int,
+    j: int,
+    e: int,
+    agents: int,
+    line: float,
+    goes_first: bool,
+    dt: float,
+) -> float:
+    """Return the reaction of a driver of the population to an agent that it would meet.
+
+    line: metres from its front to where it would wait.
+    """
+    style = bank.style[e, i]
+    speed = wp.max(state.speed[b, i], 0.0)
+    other_speed = wp.abs(perceived.speed[b, j])
+    other_accel = float(0.0)
+    if j < agents:
+        other_accel = state.accel[b, j]
+    is_there = meeting.begin < COVERED
+    other_need = float(FAR)
+    if not is_there:
+        other_need = other_speed / (2.0 * meeting.begin)
+    power = driver_power(speed, style)
+    end = meeting.end
+    if is_there and other_accel < -STOPS_THERE and other_speed < -2.0 * other_accel * end:
+        end = FAR  # it may stop in the way
+    early = early_distance(meeting.near, speed, state.accel[b, i], bank.manner[e, i][1], style)
+    stop = early_react(driver_yields(speed, meeting.near, style), driver_yields(speed, early, style), speed, style)
+    comes_after = driver_arrives_after(speed, meeting.near, end + AFTERWARDS, style)
+    react = wp.max(stop, comes_after)
+    if speed * end < meeting.near:
+        react = wp.max(react, -style[3] - power)  # it has passed by then in any case
+    # the other one stops if it goes on to brake a little harder than now
+    stops = other_accel < -0.1 and other_speed < TURNS and other_speed < 2.0 * (BRAKES - other_accel) * meeting.begin
+    stands = other_speed < WAITING and other_accel < STARTS
+    if goes_first and ((stops and other_need < STILL_STOPS) or (stands and other_need < RELIES)):
+        return 0.0  # the other one stops already, or waits
+    if meeting.joins == 1 and perceived.kind[b, j] != AgentKind.WALKER:
+        follows = wp.max(driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - power)
+        lead = meeting.gap + bank.body[bank.model[e, i]][0] + perceived.half[b, j][0]
+        parallel = wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > PARALLEL
+        if line <= -1.0 or is_there or parallel:
+            # where two ways become one, the driver behind makes room; side by side, the one without priority
+            if lead > JOINS or (lead > -JOINS and not goes_first):
+                return wp.min(follows, react)
+            is_ahead = is_there or parallel or (lead < -JOINS and goes_first)
+            if speed < LETS_BELOW and not goes_first and state.aim[b, i][0] < state.shift[b, i][1]:
+                is_ahead = bool(False)  # who begins to change lanes from rest is not ahead yet
+            if is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
+                return 0.0
+        elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
+            # it is going to be ahead: an early lift of the foot is enough
+            return wp.max(follows, -style[3] - power)
+        elif lead > 0.0:
+            react = wp.max(react, follows)
+    if goes_first and (other_need < WARY or (other_need < RELIES and meeting.near < ENTERED)):
+        return 0.0  # the other one can stop
+    if goes_first and other_need < RELIES:
+        return -power - DOUBTS * style[3]  # it should, but does not yet
+    if speed < LETS_BELOW and comes_after < -HOLDS * power:
+        react = wp.min(react, -power - HOLDS)  # it does not start only to stop again
+    if meeting.near < ENTERED and speed > LETS_BELOW and not is_there:
+        # in the stretch already, it goes on if it leaves it in time
+        sooner = meeting.begin
+        if wp.min(speed * sooner + 0.5 * power * sooner * sooner, state.aim[b, i][1] * sooner) > meeting.far:
+            return 0.0
+    need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
+    if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
+        return 0.0  # most of the stretch lies behind
+    if waits_at_line(bank, roads, state, perceived, b, i, j, e, goes_first, line, dt):
+        # rolling beyond the line, it stops where the conflict is
+        if speed * speed < 3.0 * style[3] * (line + 0.5) and line + 1.0 < meeting.near:
+            stop = driver_yields(speed, wp.max(line, 0.0), style)
+            if comes_after < -0.3 * power and speed < CREEPS:
+                react = stop
+            else:
+                react = wp.min(react, wp.max(stop, comes_after))
+    return react
 
 
 @wp.kernel(enable_backward=False)
@@ -760,6 +908,7 @@ def react_to_agents(
         walks = perceived.kind[b, j] == AgentKind.WALKER
         aim = state.aim[b, i]
         react = float(0.0)
+        crossing_react = float(0.0)
         leads = int(0)
         style = bank.style[e, i]
         judgement = wp.vec2(1.0, 0.0)
@@ -772,11 +921,11 @@ def react_to_agents(
             # in the junction, and so short that its front seems to be before it
             if state.waited[b, i] > LOCKED:
                 line = -FAR
+        c = wp.cos(pose[2])
+        s = wp.sin(pose[2])
+        longitudinal = (other_pose[0] - pose[0]) * c + (other_pose[1] - pose[1]) * s
         if flags != 2:
-            c = wp.cos(pose[2])
-            s = wp.sin(pose[2])
             heading = wp.vec2(wp.cos(other_pose[2]), wp.sin(other_pose[2]))
-            longitudinal = (other_pose[0] - pose[0]) * c + (other_pose[1] - pose[1]) * s
             stands = wp.abs(perceived.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
             margin = 0.3
             if walks:
@@ -804,8 +953,22 @@ def react_to_agents(
                 sight,
             )
             if leader[0] < FAR:
-                react = follow(speed, wp.max(leader[1], 0.0), judgement[0] * leader[0], style)
-                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, sight)) * LEADERS + j)
+                leader_gap = judgement[0] * leader[0]
+                if style[0] > 0.0:
+                    leader_gap = wp.max(leader_gap + BACKS_TIME * wp.min(perceived.speed[b, j], 0.0), 0.0)
+                react = follow(speed, wp.max(leader[1], 0.0), leader_gap, style)
+                if (
+                    style[0] > 0.0
+                    and (flags == 3 or not looks_at_crossing(state, b, i))
+                    and not walks
+                    and heading[0] * c + heading[1] * s < ALIGNED
+                    and wp.abs(perceived.speed[b, j]) > CROSSES
+                ):
+                    # it leaves the way again: what counts is when
+                    crossing_react = react
+                    react = 0.0
+                else:
+                    wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, sight)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
                 contact_range = NOSE_TO_NOSE
@@ -826,6 +989,14 @@ def react_to_agents(
                         state.stalled[b, i] = 1
                     elif not room_behind(perceived, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
+                if (
+                    style[0] > 0.0
+                    and leads == 1
+                    and leader[0] < CLOSED_UP
+                    and wp.min(state.waited[b, i], perceived.waited[b, j]) > JAMMED
+                    and perceived.way[b, j][1] < other_half[0] + 0.5
+                ):
+                    state.stalled[b, i] = 1  # makes room for somebody who may have to back out of the junction
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
                 # a driver of the population does not brake hard for it
@@ -845,100 +1016,37 @@ def react_to_agents(
             margin = 0.4
             if walks:
                 margin = 1.0
-            pick_up = float(PICKS_UP)
-            goes_first = bool(False)
-            margin_strides = int(0)
-            other_accel = float(0.0)
-            merges = bool(False)
-            waits = bool(False)
             if style[0] > 0.0:
-                pick_up = 0.8 * style[2]
                 goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
-                goes_first = change_priority(perceived, b, i, j, goes_first)
-                crosses = wp.abs(wp.sin(other_pose[2] - pose[2])) > 0.5 or wp.cos(other_pose[2] - pose[2]) < -0.5
-                turn = other_pose[2] - pose[2]
-                aside = wp.abs(
-                    (other_pose[1] - pose[1]) * wp.cos(pose[2]) - (other_pose[0] - pose[0]) * wp.sin(pose[2])
+                goes_first = change_priority(perceived, b, i, j, goes_first) or judgement[1] > 0.0
+                if speed < LETS_BELOW and wp.abs(perceived.speed[b, j]) > PASSES:
+                    # who starts lets somebody pass who is about to
+                    other_distance = wp.length(wp.vec2(other_pose[0] - pose[0], other_pose[1] - pose[1]))
+                    if other_distance < SOON_THERE * wp.abs(perceived.speed[b, j]):
+                        goes_first = False
+                meeting = meet_driver(
+                    bank, roads, state, perceived, b, i, j, e, agents, longitudinal, margin, goes_first
                 )
-                merges = wp.cos(turn) > 0.8 and aside > 1.5 and not walks
-                if not goes_first and not walks and crosses:
-                    margin_strides = MARGIN
-                    if j < agents:
-                        other_accel = wp.clamp(state.accel[b, j], 0.0, 2.5)
-                if j < agents:
-                    waits = (perceived.speed[b, j] < CREEPS and state.accel[b, j] < -0.1) or (
-                        perceived.speed[b, j] < TURNS and state.accel[b, j] < -BRAKES
+                if meeting.begin > COVERED:
+                    react = wp.min(react, crossing_react)
+                if meeting.near < FAR:
+                    react = wp.min(
+                        react,
+                        driver_gives_way(
+                            bank, roads, state, perceived, meeting, b, i, j, e, agents, line, goes_first, dt
+                        ),
                     )
-            conflict = conflict_gap(
-                roads,
-                perceived,
-                b,
-                j,
-                route,
-                shift,
-                aim[0],
-                speed,
-                aim[1],
-                own_body,
-                other_half,
-                margin,
-                bank.manner[e, i][0],
-                pick_up,
-                looks_longer(row(roads.rule, first), offset, own_body[0], speed, style),
-                margin_strides,
-                other_accel,
-            )
-            gap = conflict[0]
-            # who can still stop before a conflict leaves a margin; who is beyond that goes on, and clears it
-            committed = float(COMMITTED)
-            if state.accel[b, i] < -BRAKES:
-                committed = STILL_STOPS
-            if conflict[2] < gap and speed * speed < 2.0 * committed * wp.max(conflict[2] - YIELD_LEAST, 0.1):
-                gap = conflict[2]
-            if gap < FAR:
-                near = 0.5 * speed
-                if style[0] > 0.0:
-                    # who has priority relies on the other one as long as that one can stop
-                    other_speed = wp.abs(perceived.speed[b, j])
-                    if other_speed * (conflict[1] - other_speed / (2.0 * RELIES)) < 0.5:
-                        near = FAR
-                else:
+            else:
+                gap = conflict_gap(
+                    roads, perceived, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin
+                )
+                if gap < FAR:
                     goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
                     goes_first = change_priority(perceived, b, i, j, goes_first)
-                at_line = bool(False)
-                if judgement[1] > 0.0:
-                    goes_first = True  # an error: it does not look who has priority
-                if not goes_first and line > -1.0 and not walks and speed * speed < 8.0 * (line + 1.5):
-                    # it is waited before the junction, not in it, but to turn left on green
-                    index = roads.path_signal[first]
-                    signal_now = int(SignalState.OFF)
-                    if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
-                        signal_now = light(bank, roads, state, perceived, b, i, e, index, dt)
-                    entered = is_in_junction(perceived, b, j)
-                    crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
-                    if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
-                        at_line = wp.max(line, 0.0) + 1.0 < gap
-                        if style[0] > 0.0 and speed * speed > 3.0 * style[3] * (line + 0.5):
-                            at_line = bool(False)  # rolls beyond the line: stops where the conflict is
-                        else:
-                            gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
-                # whoever stands and has to wait is not expected to go after all
-                if merges:
-                    # where two lanes become one, the driver behind makes room
-                    cosine = wp.cos(pose[2])
-                    sine = wp.sin(pose[2])
-                    ahead = (other_pose[0] - pose[0]) * cosine + (other_pose[1] - pose[1]) * sine
-                    if ahead > 0.0 or (ahead == 0.0 and not goes_first):
-                        room = wp.max(ahead - own_body[0] - other_half[0], 1.0)
-                        react = wp.min(
-                            react, wp.max(follow(speed, perceived.speed[b, j], room, style), -FIRM - style[2])
-                        )
-                elif not goes_first or (gap < near and wp.abs(perceived.speed[b, j]) > STANDS and not waits):
-                    if at_line and style[0] > 0.0:
-                        react = wp.min(react, driver_yields(speed, wp.max(line, 0.0), style))
-                    elif style[0] > 0.0:
-                        react = wp.min(react, driver_yields(speed, gap, style))
-                    else:
+                    if waits_at_line(bank, roads, state, perceived, b, i, j, e, goes_first, line, dt):
+                        gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
+                    # whoever stands and has to wait is not expected to go after all
+                    if not goes_first or (gap < 0.5 * speed and wp.abs(perceived.speed[b, j]) > STANDS):
                         react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)

@@ -17,6 +17,7 @@ from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
+from ssad.core.wording import counted
 from ssad.world.roads.graph_report import describe
 from ssad.world.roads.import_page import import_page, import_page_path
 from ssad.world.roads.lane_links import Key, LaneLinks
@@ -102,7 +103,7 @@ def bake(
     )
     if metres > MAX_LANE_METRES:
         raise MapError(f"{path}: {metres:.0f} m of lanes, the limit is {MAX_LANE_METRES:.0f} m; divide the map")
-    stage(f"evaluating {len(keys)} lanes of {len(network.roads)} roads")
+    stage(f"evaluating {counted(len(keys), 'lane')} of {len(network.roads)} roads")
     # Absurd coefficients overflow; lanes without a finite shape are left out below.
     with np.errstate(all="ignore"):
         sampler = LaneSampler(network)

@@ -168,6 +168,22 @@ class _Reader:
     def fail(self, location: str, problem: str) -> NoReturn:
         raise MapError(f"{self.path}: {location}: {problem}; {REMEDY}")
 
+    def no_points(self, members: list[dict[str, tuple[str, ...]]]) -> tuple[str, str]:
+        """Return the first line that is missing, or the place of the first doubt, for a map without bounds."""
+        problem = "no lanelet in it has a bound with points"
+        for roles in members:
+            for element_id in (*roles.get("left", ()), *roles.get("right", ())):
+                if element_id not in self.ways:
+                    return f"way {element_id[:30]}", f"{problem}: the map lacks this line"
+        return self.first_doubt(problem)
+
+    def first_doubt(self, problem: str) -> tuple[str, str]:
+        """Return the place of the first doubt, and a problem of the whole map with the reason of that doubt."""
+        for reason, places in self.report.doubts.items():
+            place = next(filter(None, places), "<osm>")
+            return place, f"{problem}: {reason.partition(';')[0]}"
+        return "<osm>", problem
+
     def read(self) -> LaneletMap:
         root = self.root()
         elements = {tag: self.present(root, tag) for tag in ("node", "way", "relation")}
@@ -206,7 +222,7 @@ class _Reader:
             if (lanelet := self.lanelet(element, relation_tags[id(element)], roles)) is not None
         ]
         if not lanelets:
-            self.fail("<osm>", "no lanelet in it has a shape")
+            self.fail(*self.first_doubt("no lanelet in it has a shape"))
         self.check_rules(lanelets, rules)
         lanelet_ways = frozenset(
             element_id
@@ -273,7 +289,7 @@ class _Reader:
             for row in self.ways[element_id].points
         }
         if not point_rows:
-            self.fail("<osm>", "no lanelet in it has a bound with points")
+            self.fail(*self.no_points(members))
         return np.array(sorted(point_rows))
 
     # ------------------------------------------------------------ coordinates
@@ -375,17 +391,18 @@ class _Reader:
         lines = []
         for side in ("left", "right"):
             element_ids = roles.get(side, ())
+            lines_place = ", ".join([place, *(f"way {element_id[:30]}" for element_id in element_ids)])
             missing = [element_id for element_id in element_ids if element_id not in self.ways]
             if not element_ids or missing:
                 reason = "a lanelet refers to a line that the map lacks" if missing else "a lanelet lacks a bound"
-                self.report.doubt(f"{reason}; it is left out", place)
+                self.report.doubt(f"{reason}; it is left out", f"{place}, way {missing[0][:30]}" if missing else place)
                 return None
             point_rows = self.chain([self.ways[element_id] for element_id in element_ids])
             if point_rows is None:
-                self.report.doubt("the lines of a bound do not join; the lanelet is left out", place)
+                self.report.doubt("the lines of a bound do not join; the lanelet is left out", lines_place)
                 return None
             if len(point_rows) < 2 or _extent(self.xyz[list(point_rows)]) < SAME_PLACE:
-                self.report.doubt("a bound has fewer than two points; the lanelet is left out", place)
+                self.report.doubt("a bound has fewer than two points; the lanelet is left out", lines_place)
                 return None
             lines.append((point_rows, self.ways[element_ids[0]].tags))
         (left, left_tags), (right, right_tags) = lines

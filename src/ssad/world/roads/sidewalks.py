@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -145,6 +145,7 @@ class SidewalkNetwork:
         *,
         reverse: bool = False,
         crossing_share: float = 0.5,
+        closed: Collection[int] = (),
         offset: float = 0.0,
     ) -> Walk:
         """Draw a walk from a place on an edge; it turns back only where the network ends.
@@ -156,6 +157,7 @@ class SidewalkNetwork:
             random: Source of the draws.
             reverse: Walk towards the start of the edge.
             crossing_share: Probability of a walker to take a crossing at its end, if a sidewalk leads on as well.
+            closed: Numbers of crossings that it does not take.
             offset: Distance left of the centre line, m; cut to half the width of the narrowest edge.
 
         Raises:
@@ -173,15 +175,17 @@ class SidewalkNetwork:
         node = self.edges[edge].opposite(node)
         total = _length(lines[0])
         while total < length + SPACING:
-            edge = self._next_edge(edge, node, random, crossing_share)
+            edge = self._next_edge(edge, node, random, crossing_share, closed)
             lines.append(_resampled(self.edges[edge].line_from(node), SPACING / 2))
             edges.append(edge)
             node = self.edges[edge].opposite(node)
             total += _length(lines[-1])
         return self._walk(lines, edges, length, offset)
 
-    def _next_edge(self, edge: int, node: int, random: np.random.Generator, crossing_share: float) -> int:
-        onward = [index for index in self.edges_at[node] if index != edge]
+    def _next_edge(
+        self, edge: int, node: int, random: np.random.Generator, crossing_share: float, closed: Collection[int]
+    ) -> int:
+        onward = [index for index in self.edges_at[node] if index != edge and self.edges[index].crossing not in closed]
         if not onward:
             return edge
         takes_crossing = float(random.uniform()) < crossing_share

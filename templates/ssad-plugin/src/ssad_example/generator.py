@@ -41,5 +41,5 @@ class Corners:
         return [[Proposal(one) for one in row[self._next : self._next + count]] for row in self._points]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Counts; a search that learns looks at `Outcome.danger`."""
+        """Counts; a search that learns looks at `Outcome.proof_value`."""
         self._next += max((len(row) for row in outcomes), default=0)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ssad.core.types import AgentKind, Controller, TrafficPlan
-from ssad.metrics.human_driving import spread
+from ssad.metrics.human_driving import published, spread
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.knowledge.driver_population import draw_driver, with_driver
 from ssad.world.roads import load_town
@@ -32,6 +33,18 @@ def test_means_lie_between_those_of_the_sources() -> None:
     assert abs(values("pace").mean() - 1.0) < 0.02
 
 
+def test_lane_changes_take_as_long_and_are_as_polite_as_published() -> None:
+    durations, politeness = values("change_duration"), values("politeness")
+    means = [value.mean for value in published("lane change duration") if value.mean is not None]
+    assert durations.mean() == pytest.approx(np.mean([*means, 5.5]), abs=0.3)
+    assert durations.min() >= 3.5
+    assert durations.max() <= 8.0
+    low, high = spread("politeness")
+    assert low <= politeness.min()
+    assert politeness.max() <= high
+    assert politeness.std() == pytest.approx((high - low) / np.sqrt(12.0), rel=0.1)
+
+
 def test_nobody_is_dangerous() -> None:
     assert values("time_gap").min() >= 0.8
     assert values("standstill_gap").min() >= 1.3
@@ -49,7 +62,7 @@ def test_trucks_accelerate_less() -> None:
 
 
 def test_a_plan_gives_every_vehicle_a_driver_and_changes_nothing_else() -> None:
-    scenario = load_scenarios("natural")[0]
+    scenario = load_scenarios("natural-uniform")[0]
     graph = load_town(scenario.town)
     plan = scenario.traffic or TrafficPlan()
     uniform = build_episode(scenario, graph, seed=3)
@@ -66,7 +79,7 @@ def test_a_plan_gives_every_vehicle_a_driver_and_changes_nothing_else() -> None:
 
 
 def test_who_does_not_drive_by_itself_has_no_driver() -> None:
-    scenario = load_scenarios("natural")[0]
+    scenario = load_scenarios("natural-uniform")[0]
     agent = build_episode(scenario, load_town(scenario.town), seed=3).agents[1]
     external = replace(agent, controller=Controller.EXTERNAL)
     assert with_driver(external, "key") is external

@@ -12,7 +12,7 @@ from ssad.core.traces import trace_hash
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, scenario_of, search
-from ssad.scenarios.dynamic.policy.adv_ppo import SHIPPED, Adversary, AdvPPO
+from ssad.scenarios.dynamic.policy.adv_ppo import SHIPPED, Adversary, AdvPPO, PaperAdvPPO
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.selection import FreaSelection
@@ -28,8 +28,8 @@ def bases(*numbers: int):
 
 
 def test_it_is_a_generator() -> None:
-    found = bases(0, 11, 22, 33, 44, 55)
-    generator = generator_factory("adv-ppo")(found, seeds=[0] * len(found), budget=4)
+    found = bases(0, 9, 18, 27, 36, 45)
+    generator = generator_factory("adv-ppo-paper")(found, seeds=[0] * len(found), budget=4)
     outcomes = search(generator, found, TRIALS, budget=4)
     assert [len(row) for row in outcomes] == [1] * len(found)
     hits = [row[0].collision for row in outcomes]
@@ -53,7 +53,8 @@ def test_the_batch_changes_no_bit() -> None:
 
     def drive(*chosen):
         world = World(chosen, {TOWN.name: TOWN})
-        return [trace_hash(t) for t in rollout(world, {0: make_system("blind"), FreaSelection(): Adversary()})]
+        drivers = {0: make_system("blind"), FreaSelection(): Adversary(name="adv-ppo-paper")}
+        return [trace_hash(trace) for trace in rollout(world, drivers)]
 
     together = drive(*episodes)
     assert [drive(one)[0] for one in episodes] == together
@@ -69,7 +70,7 @@ def test_it_needs_others() -> None:
 @pytest.mark.slow
 def test_it_raises_the_collision_rate_of_the_autopilot_on_the_road() -> None:
     found = bases(*range(70))
-    outcomes = search(AdvPPO(found, seeds=[0] * 70, budget=1), found, TRIALS, budget=1)
+    outcomes = search(PaperAdvPPO(found, seeds=[0] * 70, budget=1), found, TRIALS, budget=1)
     assert sum(base.trace.end == "collision" for base in found) <= 1
     assert sum(row[0].is_valid for row in outcomes) >= 0.17 * 70
 

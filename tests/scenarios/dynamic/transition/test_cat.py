@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from copy import copy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ssad.core.errors import FormatError
 from ssad.core.generators import Base
+from ssad.core.safeio import save_npz
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.scenarios.dynamic.transition import cat as cat_module
-from ssad.scenarios.dynamic.transition.cat import Cat, traffic_motions
+from ssad.scenarios.dynamic.transition.cat import Cat, library_data, traffic_motions
 from ssad.world.roads import load_town
 from ssad.world.roads.query import LaneQuery
 
@@ -26,12 +29,7 @@ def base() -> Base:
 
 @pytest.fixture(scope="module")
 def untouched(base: Base) -> Cat:
-    patch = pytest.MonkeyPatch()
-    patch.setattr(cat_module, "EPISODES", 4)
-    traffic_motions.cache_clear()
-    made = Cat([base], seeds=[1], budget=8)
-    patch.undo()
-    return made
+    return Cat([base], seeds=[1], budget=8)
 
 
 @pytest.fixture
@@ -44,10 +42,23 @@ def cat(untouched: Cat) -> Cat:
 
 def test_recorded_motions_start_at_the_origin_and_can_be_driven(cat: Cat) -> None:
     motions, speeds = traffic_motions()
-    assert len(motions) == len(speeds) > 50
+    assert len(motions) == len(speeds) > 1000
     assert np.abs(motions[:, 0]).max() < 1e-9
     assert motions[:, 4, 0].min() > -0.5  # nobody drives backwards
     assert np.hypot(*np.diff(motions[..., :2], axis=1).T).max() / 0.25 < 20.0
+    assert np.hypot(*motions[:, 1, :2].T) / 0.25 == pytest.approx(speeds, abs=0.06)
+
+
+def test_the_library_keeps_motions_to_a_centimetre(tmp_path: Path) -> None:
+    poses = np.random.default_rng(0).uniform(-1.0, 1.0, (20, cat_module.LENGTH + 1, 3)) * [200.0, 50.0, 3.1]
+    path = tmp_path / "motions.npz"
+    save_npz(path, library_data(poses, np.arange(20.0)))
+    motions, speeds = traffic_motions(path)
+    assert np.abs(motions - poses).max(axis=(0, 1)) == pytest.approx([0.005, 0.005, 0.00005], rel=0.1)
+    assert speeds.tolist() == list(range(20))
+    save_npz(tmp_path / "other.npz", {"pose": np.zeros((3, 2, 3)), "speed": np.zeros(3)})
+    with pytest.raises(FormatError, match=r"other.npz: no library of motions; make it with"):
+        traffic_motions(tmp_path / "other.npz")
 
 
 def test_candidates_stay_on_the_road_and_their_priors_add_up(cat: Cat, base: Base) -> None:

@@ -19,7 +19,8 @@ from ssad.scenarios.dynamic.transition.road import raster_of
 from ssad.world.roads import load_town
 from ssad.world.twin import MotionState, RoadField, bodies_of, box_gap, unroll
 
-BASE, *_, OTHER = [s for s in load_scenarios("natural") if s.name.endswith(("Twinford_03/00", "Crossgate_30/06"))]
+(BASE,) = load_scenarios("natural-uniform/Twinford_03/00")
+(OTHER,) = load_scenarios("natural-uniform/Crossgate_30/06")
 TRIALS = Trials(lambda: make_system("blind"), make_system)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Controller, DriverStyle, EpisodeAgent
-from ssad.metrics.human_driving import correlations, published
+from ssad.metrics.human_driving import correlations, published, spread
 from ssad.world.models import agent_model
 
 _DATA = ("NGSIM US-101, cars, IDM", "I-24 MOTION, cars, IDM")
@@ -34,6 +34,7 @@ _REACTION = (0.75, 0.2, 0.4, 1.3)  # s: mean, spread and limits, of events that 
 _ERROR = (0.05, 0.02, 0.01, 0.1)  # relative error of gaps
 _JERK = (2.6, 0.4, 1.8, 3.6)  # m/s^3
 _OFFSET = 0.06  # m of spread between the places of drivers in their lanes
+_CHANGE = (3.5, 8.0)  # s: limits of the duration of lane changes
 
 
 @cache
@@ -46,6 +47,14 @@ def _distribution() -> tuple[F64, F64, F64]:
         spreads.append(float(np.mean([value.sd for value in values if value.sd is not None])))
     matrix = np.mean([part.matrix for part in correlations() if part.population in _DATA], axis=0)
     return np.array(means), np.array(spreads), np.linalg.cholesky(matrix)
+
+
+@cache
+def _change_duration() -> tuple[float, float]:
+    """Return the mean duration of lane changes over its sources, s, and its spread."""
+    values = published("lane change duration")
+    middles = [float(np.mean(value.values)) if value.mean is None else value.mean for value in values]
+    return float(np.mean(middles)), float(np.mean([value.sd for value in values if value.sd is not None]))
 
 
 def _truncated(random: np.random.Generator, mean: float, spread: float, low: float, high: float) -> float:
@@ -87,6 +96,8 @@ def draw_driver(kind: AgentKind, *key: object, errors: float = 0.0) -> DriverSty
         lane_offset=0.0 if heavy else _truncated(random, 0.0, _OFFSET, -0.12, 0.12),
         errors=errors,
         key=int(random.integers(0, 1 << 23)),
+        politeness=float(random.uniform(*spread("politeness"))),
+        change_duration=_truncated(random, *_change_duration(), *_CHANGE),
     )
 
 

@@ -4,8 +4,10 @@
     from ssad.world.selection import FreaSelection
     traces = rollout(world, {0: make_system("autopilot"), FreaSelection(count=1): Adversary()})
 
-An adversary seeks the goal, a point 6.5 m ahead of the ego on the ego's own route (`ssad.world.rewards.adversary`). It
-steers, accelerates and drives in reverse; it has no brake. `ssad train adversary` trains it.
+An adversary knows its goal, a point 6.5 m ahead of the ego on the ego's own route, and the road around it. It steers,
+accelerates and brakes, and was rewarded for proven collisions (`ssad.world.rewards.proving`). That of the paper seeks
+the goal itself (`ssad.world.rewards.adversary`), sees no road, and drives in reverse instead of braking; it is called
+`adv-ppo-paper`. `ssad train adversary` trains both.
 
 Source: the paper, equation 6; FREA (Chen et al. 2024), its adversary `ppo`.
 """
@@ -43,7 +45,7 @@ class Adversary(PolicyDriver):
 
 
 class AdvPPO:
-    """Adv.PPO: a learned policy drives the vehicle nearest to the ego into its path; one rollout per base."""
+    """Adv.PPO: a learned policy drives the vehicle nearest to the ego, in search of proof; one rollout per base."""
 
     name = "adv-ppo"
 
@@ -67,8 +69,14 @@ class AdvPPO:
         """Ignore the outcomes: the policy is already trained."""
 
 
+class PaperAdvPPO(AdvPPO):
+    """Adv.PPO as in the paper: it seeks a point before the ego, on the road or off it, and cannot brake."""
+
+    name = "adv-ppo-paper"
+
+
 class Frea(AdvPPO):
-    """FREA: Adv.PPO with a policy that was rewarded only for collisions that the ego could still avoid."""
+    """FREA: Adv.PPO with a learned feasible region as a critic, which keeps the ego a way out."""
 
     name = "frea"
 

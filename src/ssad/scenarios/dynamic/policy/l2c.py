@@ -6,7 +6,8 @@ log likelihood, weighted by how much worse for the ego a draw was than the other
 
 Source: the paper, section on driving policies; Ding et al., Learning to collide, IROS 2020 (arXiv 2003.01197), in the
 form that SafeBench (Xu et al. 2022) gives it: draws in [-1, 1], softplus of the spread, a bonus for entropy. SafeBench
-learns over a thousand episodes of many routes; here each base has its own distribution, and steps are larger.
+learns over a thousand episodes of many routes; here each base has its own distribution, and steps are larger. It seeks
+collisions that may be proven; `l2c?objective=danger` seeks any, as in the paper.
 """
 
 from __future__ import annotations
@@ -78,8 +79,8 @@ class L2C(BoxSearch):
 
     name = "l2c"
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        super().__init__(bases, seeds=seeds, budget=budget)
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, objective: str = "proof") -> None:
+        super().__init__(bases, seeds=seeds, budget=budget, objective=objective)
         self._random = [generator("l2c", seed) for seed in seeds]
         self._of = [_Distribution(box.dimension) for box in self.boxes]
         self._draws: list[F64] = [np.zeros((0, box.dimension)) for box in self.boxes]

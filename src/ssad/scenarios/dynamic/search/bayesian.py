@@ -32,8 +32,8 @@ class Bayesian(BoxSearch):
 
     name = "bayesian"
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        super().__init__(bases, seeds=seeds, budget=budget)
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, objective: str = "proof") -> None:
+        super().__init__(bases, seeds=seeds, budget=budget, objective=objective)
         self._random = [generator("bayesian", seed) for seed in seeds]
         self._tried = [np.zeros((0, box.dimension)) for box in self.boxes]
         self._danger = [np.zeros(0) for _ in self.boxes]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import F64, Episode, Scenario
 from ssad.scenarios.dynamic.catalogue import scenario_type
@@ -92,12 +92,29 @@ class ParameterBox:
         return violated_constraint(self.scenario_at(point)) is None
 
 
+OBJECTIVES: dict[str, Callable[[Outcome], float]] = {
+    "proof": lambda outcome: outcome.proof_value,
+    "danger": lambda outcome: outcome.danger,
+}
+"""What a search can maximise: see `Outcome`. `danger` counts a collision with an ego that stands as any other."""
+
+
 class BoxSearch(ABC):
-    """Search over the parameter boxes of several bases, each independent of the others."""
+    """Search over the parameter boxes of several bases, each independent of the others.
+
+    Args:
+        bases: The bases.
+        seeds: Root of the random numbers of each.
+        budget: Rollouts of each.
+        objective: Name in `OBJECTIVES`; searches that do not learn have none.
+    """
 
     name: ClassVar[str]
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, objective: str = "proof") -> None:
+        if objective not in OBJECTIVES:
+            raise unknown_name("objective of a search", objective, OBJECTIVES)
+        self._objective = OBJECTIVES[objective]
         self.boxes = [ParameterBox.of(base.scenario) for base in bases]
         self.budget = budget
         self.seeds = list(seeds)
@@ -117,7 +134,7 @@ class BoxSearch(ABC):
         """Return the next points [0 to count, D] of the unit cube to try in a base."""
 
     def learn(self, index: int, points: F64, danger: F64) -> None:  # noqa: B027  nothing to learn by default
-        """Learn from the danger [n] of points [n, D]; larger is worse for the ego."""
+        """Learn from the values [n] of points [n, D]; larger is better for the search."""
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Return the scenarios at the next points of each base."""
@@ -128,6 +145,6 @@ class BoxSearch(ABC):
         ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Pass the danger of the proposed points to `learn`."""
+        """Pass the values of the proposed points to `learn`."""
         for base_index, (points, base_outcomes) in enumerate(zip(self._last_points, outcomes, strict=True)):
-            self.learn(base_index, points, np.array([outcome.danger for outcome in base_outcomes]))
+            self.learn(base_index, points, np.array([self._objective(outcome) for outcome in base_outcomes]))

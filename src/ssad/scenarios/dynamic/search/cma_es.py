@@ -24,10 +24,10 @@ class CmaEs(BoxSearch):
 
     name = "cma-es"
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, objective: str = "proof") -> None:
         from cmaes import CMA
 
-        super().__init__(bases, seeds=seeds, budget=budget)
+        super().__init__(bases, seeds=seeds, budget=budget, objective=objective)
         self._search: list[Any] = [
             CMA(
                 mean=np.clip(box.nominal(), 0.05, 0.95),

@@ -45,8 +45,8 @@ class _SearchState:
 class _LocalSearch(BoxSearch):
     """Local search: move to the most dangerous neighbour, and restart elsewhere after a collision."""
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        super().__init__(bases, seeds=seeds, budget=budget)
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, objective: str = "proof") -> None:
+        super().__init__(bases, seeds=seeds, budget=budget, objective=objective)
         self._random = [generator(self.name, seed) for seed in seeds]
         self._states = [self._begin(base_index, box.nominal()) for base_index, box in enumerate(self.boxes)]
 

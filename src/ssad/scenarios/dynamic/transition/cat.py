@@ -16,19 +16,20 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import torch
 
+from ssad.core import safeio
+from ssad.core.errors import FormatError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.geometry import obb_distance, to_local, to_world
 from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import F64, AgentKind, Bool, Controller, EpisodeTrace
-from ssad.scenarios.dynamic.episode import build_episode
+from ssad.core.types import F64, Bool, EpisodeTrace
 from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
-from ssad.scenarios.dynamic.sets import load_scenarios
 from ssad.scenarios.dynamic.transition.king import STEP, King, adversary_candidates, resample_trace
 from ssad.scenarios.dynamic.transition.road import raster_of
 
@@ -39,7 +40,8 @@ STRIDE: Final = 2  # steps: overlaps are looked for every 0.5 s
 DECAY: Final = 0.99
 SPREAD: Final = 0.5  # m/s: kernel width on the difference of initial speeds
 STARTS: Final = 4  # steps between the moments from which the opponent may drive otherwise: 1 s
-EPISODES: Final = 16  # of natural traffic that the prior is learned from
+MOTIONS: Final = Path(__file__).with_name("motions.npz")
+UNITS: Final = (0.01, 0.01, 0.0001)  # m, m, rad: steps of the poses in the library
 
 
 @dataclass(frozen=True)
@@ -166,31 +168,41 @@ class Cat:
         return np.asarray(plausible, np.float64)
 
 
-@lru_cache(maxsize=1)
-def traffic_motions() -> tuple[F64, F64]:
-    """Return the motions that the prior is learned from: vehicles of the Autopilot in natural scenarios.
+@lru_cache(maxsize=4)
+def traffic_motions(path: Path = MOTIONS) -> tuple[F64, F64]:
+    """Return the motions that the prior is learned from: motor vehicles of SSAD's own traffic.
+
+    Args:
+        path: Library, made by `python -m benchmarks.traffic_reference`.
 
     Returns:
         Motions [K, LENGTH + 1, 3], x, y, yaw in the frame of their first pose, and their first speeds [K], m/s.
+
+    Raises:
+        FormatError: The file is none.
     """
-    from ssad.world.roads import load_town
-    from ssad.world.rollout import rollout
-    from ssad.world.world import World
-
-    scenarios = load_scenarios("natural")
-    selected = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
-    graphs = {name: load_town(name) for name in {scenario.town for scenario in selected}}
-    # a separate seed: the prior must not come from the searched episodes
-    episodes = [build_episode(scenario, graphs[scenario.town], seed=1_000_003) for scenario in selected]
-    recorded = [motion_windows(trace) for trace in rollout(World(episodes, graphs, ego=Controller.AUTOPILOT), {})]
-    return np.concatenate([motions for motions, _ in recorded]), np.concatenate([scenario for _, scenario in recorded])
+    arrays = safeio.load_npz(path)
+    if set(arrays) != {"pose", "speed"} or arrays["pose"].shape[1:] != (LENGTH + 1, 3):
+        raise FormatError(f"{path}: no library of motions; make it with python -m benchmarks.traffic_reference")
+    return arrays["pose"] * np.array(UNITS), arrays["speed"].astype(np.float64)
 
 
-def motion_windows(trace: EpisodeTrace) -> tuple[F64, F64]:
-    """Return all motions of 8 s in a trace, one of each vehicle every second, as `traffic` does."""
+def library_data(motions: F64, speeds: F64) -> dict[str, np.ndarray[Any, Any]]:
+    """Return the content of a library of motions: poses in steps of 1 cm and 0.0001 rad, and speeds."""
+    pose = np.clip(np.round(motions / np.array(UNITS)), -32768, 32767).astype(np.int16)
+    return {"pose": pose, "speed": speeds.astype(np.float32)}
+
+
+def motion_windows(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[F64, F64]:
+    """Return all motions of 8 s of some agents in a trace, one of each agent every second, as `traffic_motions` does.
+
+    Args:
+        trace: The trace of the episode.
+        agents: Indices of the agents.
+    """
     motion = resample_trace(trace)
     motions, speeds = [np.zeros((0, LENGTH + 1, 3))], [0.0][:0]
-    for agent in np.flatnonzero(trace.kind <= AgentKind.BICYCLE).tolist():
+    for agent in agents:
         for start in range(0, motion.shape[1] - LENGTH - 1, STARTS):
             window = motion[agent, start : start + LENGTH + 1]
             if (window[:, 5] > 0.5).all() and np.hypot(*np.ptp(window[:, :2], axis=0)) > 1.0:
