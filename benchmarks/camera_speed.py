@@ -115,7 +115,7 @@ class Driver:
 
 def in_the_loop(scenes: int, device: str, steps: int) -> dict[str, Any]:
     """Seconds a step of scenes with a camera each, as medians."""
-    chosen = load_scenarios("natural")[:scenes]
+    chosen = load_scenarios("natural-uniform")[:scenes]
     graphs = {name: load_town(name) for name in {scenario.town for scenario in chosen}}
     endless = EpisodeLimits(max_steps=10**6, max_time=1e6, contact="count")
     episodes = [replace(build_episode(s, graphs[s.town], seed=0), limits=endless) for s in chosen]

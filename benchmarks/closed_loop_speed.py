@@ -88,7 +88,7 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     eyes = CameraPerceiver(detector, cameras, **options)
     driver = PerceivingDriver(eyes, rate=rate)
     driver.to(device)
-    scenarios = load_scenarios("natural-twinford")
+    scenarios = [s for s in load_scenarios("natural-uniform") if s.town == "Twinford"]
     town = load_town(scenarios[0].town)
     episodes = [build_episode(scenarios[k % len(scenarios)], town, seed=k) for k in range(scenes)]
     onboard = Onboard(device=device, resident=True)

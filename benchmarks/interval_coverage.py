@@ -221,7 +221,7 @@ def natural_sizes() -> F64:
 
 
 def route_layout(routes: int, natural: F64) -> Clusters:
-    """Routes with unequal numbers of cases: `natural-uniform`; `frea`, 15 routes of 10; else twice those of the first."""
+    """Routes with unequal numbers of cases: `natural-uniform`; `frea`, 15 of 10; else twice those of the first."""
     if routes == len(natural):
         size = natural
     elif routes == 15:

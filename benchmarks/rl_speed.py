@@ -88,7 +88,7 @@ def page(found: dict[str, Any]) -> None:
 def main() -> None:
     """Print the rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenarios", default="natural")
+    parser.add_argument("--scenarios", default="natural-uniform")
     parser.add_argument("--steps", type=int, default=64 * 128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--no-highway", action="store_true")

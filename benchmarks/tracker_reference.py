@@ -256,7 +256,8 @@ def main() -> None:
         from ssad import load_scenarios
         from ssad.detectors import make_detector
 
-        chosen = load_scenarios("natural-twinford")[:: 71 // DRIVES][:DRIVES]
+        twinford = load_scenarios("natural-twinford")
+        chosen = twinford[:: len(twinford) // DRIVES][:DRIVES]
         save([boxes_of_drive(scenario, make_detector("yolov5n")) for scenario in chosen])
         return
     drives = load()

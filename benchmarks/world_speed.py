@@ -36,7 +36,7 @@ def make_look(world: World) -> Any:
 
 def make_world(batch: int, device: str, episodes: int) -> World:
     """`batch` scenes over a bank of natural episodes, egos on Autopilot, started again when they end."""
-    scenarios = load_scenarios("natural")
+    scenarios = load_scenarios("natural-uniform")
     graphs = {s.town: load_town(s.town) for s in scenarios}
     bank = [build_episode(s, graphs[s.town], seed=k) for k, s in enumerate(scenarios)]
     # the busiest first, so that one scene alone holds about as many vehicles as highway-env's

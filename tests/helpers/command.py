@@ -17,13 +17,14 @@ from ssad import cli
 
 
 def ssad(*words: str | Path) -> CompletedProcess[str]:
-    """Run in this process: it starts at once."""
+    """Run in this process, which starts at once, with one worker unless the words ask for more."""
     out, errors = io.StringIO(), io.StringIO()
     argv = ["ssad", *map(str, words)]
     # a driving system of the user's is looked for in the working folder: not by the tests after this one
     with (
         mock.patch.object(sys, "argv", argv),
         mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch("ssad.engine.pool.default_workers", return_value=1),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(errors),
         pytest.raises(SystemExit) as end,

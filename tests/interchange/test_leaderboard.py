@@ -157,7 +157,7 @@ def test_routes_without_scenarios_are_free_drives_in_traffic(tmp_path: Path) -> 
     )
     done = ssad("import", "routes", tmp_path / "routes", "--name", "alone")
     assert done.returncode == 0, done.stderr
-    assert "set alone: 1 scenarios on ProvingGround" in done.stdout
+    assert "set alone: 1 scenario on ProvingGround" in done.stdout
 
 
 def test_a_free_drive_on_an_unknown_town_is_named(tmp_path: Path) -> None:

@@ -260,8 +260,12 @@ class GroundOccupancy:
     def __init__(self, street: Street) -> None:
         vertices = street.vertices
         upright = vertices[(vertices[:, 2] > 0.35) & (vertices[:, 2] < 2.4)]
-        squares: list[list[int]] = np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0).tolist()
-        self.occupied_squares = {(x, y) for x, y in squares}
+        squares = np.floor(upright[:, :2] * 2).astype(np.int64)
+        low, high = squares.min(axis=0, initial=0), squares.max(axis=0, initial=0)
+        row_count = high[1] - low[1] + 1
+        # Each square is one number: equal rows of a matrix are found far more slowly.
+        columns, rows = np.divmod(np.unique((squares[:, 0] - low[0]) * row_count + squares[:, 1] - low[1]), row_count)
+        self.occupied_squares = set(zip((columns + low[0]).tolist(), (rows + low[1]).tolist(), strict=True))
 
     def is_free(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
         """Return True if a rectangle is free."""

@@ -328,7 +328,7 @@ def test_a_random_severity_is_that_of_the_moment(kitti: Path, tmp_path: Path) ->
 def test_a_killed_run_goes_on_and_workers_change_no_byte(tmp_path: Path) -> None:
     source, draws = tmp_path / "pictures", np.random.default_rng(1)
     for number in range(16):
-        picture = draws.integers(0, 256, (360, 640, 3), dtype=np.uint8)
+        picture = draws.integers(0, 256, (180, 320, 3), dtype=np.uint8)
         save_picture(source / f"{number:02d}.{'png' if number % 2 else 'jpg'}", picture)
     words = ("shift", source, tmp_path / "out", "--shifts", "snow,gaussian", "--severity", "random", "--workers", "2")
     program = f"stop_at = 5\n{STOPS}\nfrom ssad.cli import main\nmain()"

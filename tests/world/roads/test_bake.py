@@ -337,7 +337,7 @@ def test_maps_come_in_without_carla(tmp_path: Path) -> None:
         env=os.environ | {"SSAD_HOME": str(tmp_path / "home")},
     )
     assert done.returncode == 0, done.stderr
-    assert "town road: 1 lanes" in done.stdout
+    assert "town road: 1 lane, " in done.stdout
 
 
 def test_import_makes_a_town(tmp_path: Path, ssad_home: Path) -> None:

@@ -85,9 +85,9 @@ def paint_mask(mesh: Mesh, size: tuple[int, int], rectangle: Rectangle = (0.0, 0
     panel_uv = mesh.uv[mesh.panel >= 0].astype(np.float64)
     corners = (panel_uv - [u0, v0]) / [u1 - u0, v1 - v0] * [width, height]
     quarter_texels = np.zeros((4 * height, 4 * width), np.uint8)  # in quarters of a texel, drawn with their edges
-    for face in corners:
-        # Coordinates with 4 fractional bits; the centre of the first quarter texel is at 0 in OpenCV.
-        cv2.fillConvexPoly(quarter_texels, np.rint(face * 4 * 16 - 8).astype(np.int32), 1, cv2.LINE_8, 4)
+    # Coordinates with 4 fractional bits; the centre of the first quarter texel is at 0 in OpenCV.
+    for face in np.rint(corners * 4 * 16 - 8).astype(np.int32):
+        cv2.fillConvexPoly(quarter_texels, face, 1, cv2.LINE_8, 4)
     return np.asarray(quarter_texels.reshape(height, 4, width, 4).max((1, 3)) > 0)
 
 
