@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import gc
 import os
@@ -77,13 +78,9 @@ def pytest_collection() -> Iterator[None]:
         return (yield)
     finally:
         gc.freeze()
+        atexit.register(gc.unfreeze)  # what was set apart is let go with the rest, or libraries complain of leaks
         gc.set_threshold(20_000, 20, 20)
         gc.enable()
-
-
-def pytest_sessionfinish() -> None:
-    """What was set apart is let go with the rest, or libraries complain of leaks."""
-    gc.unfreeze()
 
 
 def find_data() -> Path | None:
