@@ -226,6 +226,20 @@ def test_only_what_is_drawn_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
     assert built == ["car", "pedestrian", "pedestrian"], "none is built twice"
 
 
+def test_each_person_is_another_and_built_once_for_all_renderings() -> None:
+    def meshes(drive: str) -> list[Mesh]:
+        objects = SceneObjects(0.1, (drive,))
+        for _ in range(2):
+            objects.make("pedestrian", "adult", (0.6, 0.6, 1.8), phases=2)
+        return objects.meshes[:]
+
+    drive, again, other = meshes("one"), meshes("one"), meshes("other")
+    assert [mesh is same for mesh, same in zip(drive, again, strict=True)] == [True] * 4
+    assert drive[0].materials == drive[1].materials, "one person in two phases"
+    assert (drive[0].vertices != drive[1].vertices).any()
+    assert len({mesh.materials for mesh in (drive[0], drive[2], other[0], other[2])}) == 4
+
+
 def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[object, ...]] = []
 

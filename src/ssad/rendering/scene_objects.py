@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import overload
 
 import numpy as np
@@ -246,12 +246,23 @@ class SceneObjects:
         """Add the meshes of one body in `phases` phases of its cycle; return its description for `add`."""
         key = (*self.key, *(name or (len(self.meshes),)))
 
-        def build(phase: float | None) -> Mesh:
-            rng = generator("record mesh", *key)
-            return make_body(kind, style=style, size=size, generator=rng, detail=self.detail, phase=phase)
-
+        build = partial(_drawn_mesh, make_body, key, kind, style, size, self.detail)
         cycle_phases = [2 * np.pi * index / phases if phases > 1 else None for index in range(phases)]
         return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle_phases)
+
+
+@lru_cache(maxsize=512)
+def _drawn_mesh(  # noqa: PLR0917
+    make: Callable[..., Mesh],
+    key: tuple[object, ...],
+    kind: str,
+    style: str,
+    size: Size,
+    detail: int,
+    phase: float | None,
+) -> Mesh:
+    # A recording is rendered clean and under each of its perturbations, an episode for each of its drivers.
+    return make(kind, style=style, size=size, generator=generator("record mesh", *key), detail=detail, phase=phase)
 
 
 class GroundOccupancy:
