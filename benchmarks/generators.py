@@ -38,7 +38,7 @@ COLUMNS = {
 
 
 def measure(
-    folder: Path, *, set_name: str, systems: Sequence[str], generators: Sequence[str], budget: int, workers: int | None
+    folder: Path, *, set_name: str, systems: Sequence[str], generators: Sequence[str], budget: int, **options: Any
 ) -> dict[str, Any]:
     """Run the suite in one set, or go on where it stopped; return the row of each system and generator.
 
@@ -48,7 +48,7 @@ def measure(
         systems: Driving systems.
         generators: Generators.
         budget: Rollouts of each base.
-        workers: Worker processes; None: one per core.
+        options: `workers` and `device` of `ssad.run`.
     """
     # The suite is the same whatever part of it is run, so that the parts add up in one folder.
     changes = {
@@ -60,7 +60,7 @@ def measure(
         "chunk": 75,
     }
     only = {"system": list(systems), "generator": list(generators)}
-    results = ssad.run("adversarial", set=changes, out=folder / set_name, workers=workers, only=only)
+    results = ssad.run("adversarial", set=changes, out=folder / set_name, only=only, **options)
     lines: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for line in results.rows:
         lines.setdefault((str(line["system"]), str(line["generator"])), []).append(line)
@@ -157,8 +157,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sets", default=",".join(SETS), help="sets of natural traffic, with commas")
     parser.add_argument("--systems", default=",".join(EGOS), help="driving systems, with commas")
     parser.add_argument("--generators", default=",".join(GENERATORS), help="generators, with commas")
-    parser.add_argument("--budget", type=int, default=32, help="rollouts of each base")
+    parser.add_argument("--budget", type=int, default=24, help="rollouts of each base")
     parser.add_argument("--workers", type=int, default=None, help="worker processes; by default one per core")
+    parser.add_argument("--device", default="auto", help="where the world computes: auto, cpu or cuda")
     parser.add_argument("--json", type=Path, default=RESULTS, help="where the shares are kept")
     parser.add_argument("--page", action="store_true", help="write docs/results/generators.md")
     given = parser.parse_args(arguments)
@@ -173,6 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             generators=names(given.generators),
             budget=given.budget,
             workers=given.workers,
+            device=given.device,
         )
         data["made"] = provenance([*names(given.systems), *names(given.generators)])
         given.json.write_text(json.dumps(data, indent=1) + "\n")

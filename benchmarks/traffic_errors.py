@@ -1,4 +1,4 @@
-"""What human errors of drivers cause: `python -m benchmarks.traffic_errors --towns Crossgate --hours 60 --page`.
+"""What human errors of drivers cause: `python -m benchmarks.traffic_errors --towns Crossgate --hours 100 --page`.
 
 Drives the scenes of `benchmarks.traffic` with the population of drivers at several rates of errors, the same vehicles
 at each, and counts the errors that are made and the contacts. `--page` writes the table of docs/results/traffic.md.
@@ -65,7 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--towns", default="Crossgate", help="names, with commas")
     parser.add_argument("--errors", default="0,1,10,60", help="errors of each driver an hour, with commas")
-    parser.add_argument("--hours", type=float, default=60.0, help="vehicle-hours for each town and rate")
+    parser.add_argument("--hours", type=float, default=100.0, help="vehicle-hours for each town and rate")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")
     parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()

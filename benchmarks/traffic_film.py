@@ -28,6 +28,7 @@ from ssad.core.geometry import corners, obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.lane_strips import LAYERS, junction_areas, make_lane_strips
 from ssad.core.machine import start_warp_quietly
+from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import atomic_path, load_npz, save_npz
 from ssad.core.top_view import BODY, EDGE, GROUND, LAMP, ROAD, SIDEWALK, VEHICLE, Frame
 from ssad.core.types import AgentKind, Episode, LaneType, Route, SignalState, TrafficPlan
@@ -49,6 +50,8 @@ NEAR = 0.3  # m between two bodies worth a look
 IDLE = 15.0  # s at rest worth a look, if no signal, leader or junction explains them
 PAST_LINE = 2.5  # m beyond its stop line at which the front of a vehicle has left its place
 LATE = 1.5  # s of red after which nobody who came at yellow is left
+CREEPS = 0.6  # m/s
+SHORT_STOP = 2.0  # s
 OPEN = 20.0  # m to the next leader or line, from which nothing holds a vehicle
 BRAKE_LIGHT, TURN_LIGHT, CLOCK = (255, 40, 40), (255, 214, 0), (30, 41, 59)
 CROSSWALK, ROUND = (214, 214, 206), 4  # OpenCV draws at 1/16 pixel
@@ -309,6 +312,24 @@ def remarks(graph: LaneGraph, drive: Drive) -> list[tuple[float, str]]:
     return sorted(line for line in lines if line[0] > SETTLE)
 
 
+def summary(drive: Drive) -> str:
+    """Return how often the vehicles creep and stop, and the greatest acceleration to the side, after the settling."""
+    dt = float(drive.dt[0])
+    first = round(SETTLE / dt)
+    vehicles = np.isin(drive.kind, [AgentKind.WALKER, AgentKind.BICYCLE], invert=True)
+    speed, present = np.abs(drive.speed[first:, vehicles]), drive.present[first:, vehicles]
+    creeps = present & (speed > 0.05) & (speed < CREEPS)
+    stops: list[float] = []
+    _spells(present & (speed < 0.2), dt, lambda _step, _agent, seconds: stops.append(seconds), 0.0)
+    turned = wrap_angle(np.diff(drive.pose[first:, vehicles, 2].astype(np.float64), axis=0))
+    side = np.where(present[1:] & present[:-1], np.abs(turned) / dt * speed[1:], 0.0)
+    return (
+        f"creeping (below {CREEPS:g} m/s) {creeps.sum() / max(present.sum(), 1):.1%} of the time; {len(stops)} stops, "
+        f"{sum(seconds < SHORT_STOP for seconds in stops)} of them below {SHORT_STOP:g} s; up to {side.max():.1f} m/s² "
+        "to the side"
+    )
+
+
 def _red_starts(graph: LaneGraph, drive: Drive) -> Iterator[tuple[int, int, float]]:
     """Yield step, agent and s of red where somebody drives over a stop line on red, but for turns to the near side."""
     forward = np.stack([np.cos(drive.pose[..., 2]), np.sin(drive.pose[..., 2])], axis=-1)
@@ -403,6 +424,7 @@ def main() -> None:
     if is_new:
         for time, line in remarks(graph, drive):
             print(f"{time:6.1f} s  {line}")
+        print(summary(drive))
     name, views = views_of(graph, drive, given)
     dt, steps = float(drive.dt[0]), len(drive.speed)
     first, last = round(given.begin / dt), round(min(given.end / dt, steps))

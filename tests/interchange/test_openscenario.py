@@ -393,7 +393,10 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
         "'hero' starts at (1e+300, -5.25), outside the map",
     ),
     "no parameter": (_cut('name="fast"', 'name="slow"'), "parameter $fast is not declared"),
-    "unknown name": (_cut("$fast", "${2 * $slow}"), "AbsoluteTargetSpeed: value: expression '2 * $slow': there is no"),
+    "unknown name": (
+        _cut("$fast", "${2 * $slow}"),
+        "value: expression '2 * $slow': parameter $slow is not declared; closest: $fast",
+    ),
     "division by zero": (_cut("$fast", "${$fast / 0}"), "expression '$fast / 0': division by zero"),
     "circular": (
         _cut('value="9.0"', 'value="$fast"'),

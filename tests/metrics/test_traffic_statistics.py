@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.traffic_walkers import count_contacts
+from ssad.core.types import AgentKind
 from ssad.metrics.traffic_statistics import (
     braking_onsets,
     critical_gap,
@@ -107,6 +109,15 @@ def test_the_post_encroachment_time_of_a_crossing_is_its_delay_less_the_length_o
     assert times == pytest.approx([2.0 - 0.5], abs=0.11)
     apart = visits(pose, np.array([4.0, 4.0]), np.array([0, 1]), np.ones(pose.shape[:2], bool))
     assert not len(post_encroachment_times(apart, DT))
+    # of a vehicle and a walker, or of two vehicles
+    assert len(post_encroachment_times(stays, DT, apart=np.array([False, True]))) == 1
+    assert not len(post_encroachment_times(stays, DT, apart=np.array([False, False])))
+
+
+def test_contacts_are_counted_once_by_who_is_touched() -> None:
+    kinds = np.array([[AgentKind.CAR, AgentKind.BUS, AgentKind.WALKER, AgentKind.BICYCLE, AgentKind.WALKER]])
+    fresh = np.array([[0b01110, 0b00001, 0b10001, 0b00001, 0b00100]])
+    assert count_contacts(fresh, kinds) == {"contacts": 1, "walker contacts": 1, "cyclist contacts": 1}
 
 
 def test_who_follows_on_the_same_road_encroaches_on_nobody() -> None:

@@ -176,7 +176,7 @@ def shift_picture_folder(
     if skipped_shifts:
         print(f"left out, since they need boxes in space: {', '.join(skipped_shifts)}")
     for folder in folders:
-        report = f"{folder.root}: {folder.shifted} pictures shifted, "
+        report = f"{folder.root}: {counted(folder.shifted, 'picture')} shifted, "
         report += f"{folder.clouds} point clouds shifted, " if folder.clouds else ""
         report += f"{folder.linked} other files linked unchanged, "
         report += f"{folder.labels} of them images in folders of labels, " if folder.labels else ""

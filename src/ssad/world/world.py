@@ -45,7 +45,7 @@ from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 from ssad.world.turn_signals import turn_signals
 
-VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "7"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
 _SCRIPT, _WALK = array_types(ScriptState), array_types(WalkState)

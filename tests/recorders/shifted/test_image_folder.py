@@ -63,7 +63,7 @@ def test_a_broken_picture_fails_alone(kitti: Path, tmp_path: Path) -> None:
     (kitti / "image_2" / "000001.png").write_bytes(b"nothing")
     done = ssad("shift", kitti, tmp_path / "out", "--shifts", "uniform", "--severity", "1")
     assert done.returncode == 1
-    assert "1 pictures shifted" in done.stdout
+    assert "1 picture shifted" in done.stdout
     assert "1 failed" in done.stdout
     assert "image_2/000001.png: " in done.stdout
 

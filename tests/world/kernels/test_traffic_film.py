@@ -19,6 +19,7 @@ from benchmarks.traffic_film import (
     frames,
     recorded,
     remarks,
+    summary,
 )
 from ssad.core.top_view import BODY, LAMP, ROAD, VEHICLE
 from ssad.core.types import AgentKind, SignalState
@@ -88,6 +89,17 @@ def test_bodies_that_nearly_touch_are_told_once() -> None:
         "0 (car 0) at (122, 45): 0.10 m from 1 (walker 1), 0.0 and 1.0 m/s"
     ]
     assert len(told) == 1
+
+
+def test_the_summary_counts_stops_creeping_and_sideways_acceleration() -> None:
+    drive = still_drive()
+    speed, pose = drive.speed.copy(), drive.pose.copy()
+    speed[:, 0] = 4.0
+    speed[150:165, 0], speed[200:250, 0], speed[300:330, 0] = 0.0, 0.0, 0.3
+    pose[390, 0, 2] += 0.05  # 0.05 rad in 0.1 s at 4 m/s
+    assert summary(replace(drive, speed=speed, pose=pose)) == (
+        "creeping (below 0.6 m/s) 10.0% of the time; 2 stops, 1 of them below 2 s; up to 2.0 m/s² to the side"
+    )
 
 
 @pytest.mark.parametrize(("turn", "state", "is_told"), [(0, "RED", True), (-1, "RED", False), (0, "GREEN", False)])
