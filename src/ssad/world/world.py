@@ -34,6 +34,7 @@ from ssad.world.kernels.data import (
     array_types,
 )
 from ssad.world.kernels.drive import drive
+from ssad.world.kernels.giving_way import give_way
 from ssad.world.kernels.lane_choice import change_lanes
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import advance_noise, reset_noise
@@ -161,7 +162,7 @@ class World:
         self.places = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
         self.work = Work()
-        self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.work.count = wp.zeros(2, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
         self.work.judgement = wp.zeros((self.batch, self.agents), dtype=wp.vec2, device=device)
         if self.chance is not None:
@@ -225,6 +226,10 @@ class World:
         # Every agent may pair with every other agent, but only the ego pairs with believed objects.
         pair_capacity = self.batch * (self.agents * max(self.agents - 1, 1) + believed)
         self.work.pair = wp.zeros(pair_capacity, dtype=wp.int32, device=self.device)
+        # without drivers of the population, nobody foresees meetings
+        meeting_capacity = pair_capacity if self.bank.has_drivers else 1
+        self.work.meeting = wp.zeros(meeting_capacity, dtype=wp.int32, device=self.device)
+        self.work.crossing = wp.zeros(meeting_capacity, dtype=wp.float32, device=self.device)
         # one thread walks the list on CPU; on CUDA enough to fill the device
         pair_threads = 1 if self.device == "cpu" else min(pair_capacity, 1 << 21)
         dt, substeps, autoreset = self._settings
@@ -287,6 +292,17 @@ class World:
                 react_to_agents,
                 pair_threads,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
+            ),
+            *(
+                [
+                    self.launch(
+                        give_way,
+                        pair_threads,
+                        [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
+                    )
+                ]
+                if self.bank.has_drivers
+                else []
             ),
             self.launch(
                 change_lanes,
@@ -354,7 +370,8 @@ class World:
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """Record a launch, so that its arguments are packed only once."""
-        # `meet` is faster in blocks of 256, the default; `sight` is in the same module, which is compiled for one size
+        # `react_to_agents` is faster in blocks of 256, the default; `scan_all_agents` is in the same module, which is
+        # compiled for one size
         block_size = None if self.device == "cpu" or kernel in (scan_all_agents, react_to_agents) else BLOCK
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_size, record_cmd=True)
 
