@@ -52,6 +52,9 @@ _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_ty
 _SCRIPT, _WALK = array_types(ScriptState), array_types(WalkState)
 # The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
 _OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
+# Threads of a block on CUDA where another number is faster than `BLOCK`; kernels of one module share it.
+BLOCKS = {scan_all_agents: 256, react_to_agents: 256, give_way: 64}
+MEETING_THREADS = 1 << 16
 _IMMUTABLE = ("episodes", "graphs", "models", "bank")  # attributes that deep copies share
 # Attributes that live on the device or refer to it: a copy makes its own.
 _ON_DEVICE = (
@@ -232,6 +235,8 @@ class World:
         self.work.crossing = wp.zeros(meeting_capacity, dtype=wp.float32, device=self.device)
         # one thread walks the list on CPU; on CUDA enough to fill the device
         pair_threads = 1 if self.device == "cpu" else min(pair_capacity, 1 << 21)
+        # few pairs, and a long way each: no more threads than are resident at once
+        meeting_threads = min(pair_threads, MEETING_THREADS)
         dt, substeps, autoreset = self._settings
         bank, roads, state, perceived = self.bank.episodes, self.bank.roads, self.arrays, self.seen
         scripts, walkers = self.bank.scripts, self.bank.walkers
@@ -297,8 +302,8 @@ class World:
                 [
                     self.launch(
                         give_way,
-                        pair_threads,
-                        [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
+                        meeting_threads,
+                        [bank, roads, state, perceived, self.work, self.agents, row_count, meeting_threads, dt],
                     )
                 ]
                 if self.bank.has_drivers
@@ -370,9 +375,7 @@ class World:
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """Record a launch, so that its arguments are packed only once."""
-        # `react_to_agents` is faster in blocks of 256, the default; `scan_all_agents` is in the same module, which is
-        # compiled for one size
-        block_size = None if self.device == "cpu" or kernel in (scan_all_agents, react_to_agents) else BLOCK
+        block_size = BLOCKS.get(kernel, BLOCK) if self.device != "cpu" else None
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_size, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:

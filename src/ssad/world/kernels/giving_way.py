@@ -10,7 +10,6 @@ from ssad.core.types import AgentKind
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
-    REGISTERS,
     EpisodeArrays,
     PerceivedAgents,
     Roads,
@@ -206,7 +205,7 @@ def driver_gives_way(
     return react
 
 
-@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
+@wp.kernel(enable_backward=False)
 def give_way(
     bank: EpisodeArrays,
     roads: Roads,
