@@ -79,7 +79,7 @@ LONGER = wp.constant(6)  # strides beyond the forecast
 CROSSES = wp.constant(1.0)  # m/s of somebody in the way who is going to leave it
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
-BESIDE_CYCLIST = wp.constant(1.0)  # m to the side that a driver leaves to a cyclist, who is followed where there is less
+BESIDE_CYCLIST = wp.constant(1.0)  # m that a driver leaves beside a cyclist; where there is less, it follows
 NARROW = wp.constant(0.5)  # m: half the width of who passes a cyclist as a cyclist does
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
