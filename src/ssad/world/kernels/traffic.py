@@ -112,7 +112,7 @@ DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a
 WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
 BRAKES = wp.constant(1.0)  # m/s^2
 AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
-BESIDE_CYCLIST = wp.constant(1.0)  # m to the side that a driver leaves to a cyclist, who is followed where there is less
+BESIDE_CYCLIST = wp.constant(1.0)  # m to the side that a driver leaves to a cyclist; else it follows
 NARROW = wp.constant(0.5)  # m: half the width of who passes a cyclist as a cyclist does
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
