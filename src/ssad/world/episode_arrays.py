@@ -360,6 +360,7 @@ class Bank:
         forced: [E, S] forced signal states, -1: none.
         until: [E] time until which they are forced, s.
         walkers: Walkers of natural traffic on the device; None: there are none.
+        has_drivers: An agent is a driver of the population.
     """
 
     episodes: EpisodeArrays
@@ -377,6 +378,7 @@ class Bank:
     forced: npt.NDArray[np.int32]
     until: F32
     walkers: Walkers | None = None
+    has_drivers: bool = False
 
 
 def build(  # noqa: PLR0917
@@ -489,6 +491,7 @@ def build(  # noqa: PLR0917
         np.asarray(arrays["signal"]),
         np.asarray(arrays["limits"])[:, 3],
         walkers,
+        bool((np.asarray(arrays["style"])[..., 0] > 0.0).any()),
     )
 
 

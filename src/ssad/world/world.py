@@ -34,6 +34,7 @@ from ssad.world.kernels.data import (
     array_types,
 )
 from ssad.world.kernels.drive import drive
+from ssad.world.kernels.giving_way import give_way
 from ssad.world.kernels.lane_choice import change_lanes
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import advance_noise, reset_noise
@@ -51,6 +52,9 @@ _STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_ty
 _SCRIPT, _WALK = array_types(ScriptState), array_types(WalkState)
 # The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
 _OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
+# Threads of a block on CUDA where another number is faster than `BLOCK`; kernels of one module share it.
+BLOCKS = {scan_all_agents: 256, react_to_agents: 256, give_way: 64}
+MEETING_THREADS = 1 << 16
 _IMMUTABLE = ("episodes", "graphs", "models", "bank")  # attributes that deep copies share
 # Attributes that live on the device or refer to it: a copy makes its own.
 _ON_DEVICE = (
@@ -161,7 +165,7 @@ class World:
         self.places = wp.zeros(agent_shape, dtype=wp.vec4, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
         self.work = Work()
-        self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.work.count = wp.zeros(2, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
         self.work.judgement = wp.zeros((self.batch, self.agents), dtype=wp.vec2, device=device)
         if self.chance is not None:
@@ -225,8 +229,14 @@ class World:
         # Every agent may pair with every other agent, but only the ego pairs with believed objects.
         pair_capacity = self.batch * (self.agents * max(self.agents - 1, 1) + believed)
         self.work.pair = wp.zeros(pair_capacity, dtype=wp.int32, device=self.device)
+        # without drivers of the population, nobody foresees meetings
+        meeting_capacity = pair_capacity if self.bank.has_drivers else 1
+        self.work.meeting = wp.zeros(meeting_capacity, dtype=wp.int32, device=self.device)
+        self.work.crossing = wp.zeros(meeting_capacity, dtype=wp.float32, device=self.device)
         # one thread walks the list on CPU; on CUDA enough to fill the device
         pair_threads = 1 if self.device == "cpu" else min(pair_capacity, 1 << 21)
+        # few pairs, and a long way each: no more threads than are resident at once
+        meeting_threads = min(pair_threads, MEETING_THREADS)
         dt, substeps, autoreset = self._settings
         bank, roads, state, perceived = self.bank.episodes, self.bank.roads, self.arrays, self.seen
         scripts, walkers = self.bank.scripts, self.bank.walkers
@@ -287,6 +297,17 @@ class World:
                 react_to_agents,
                 pair_threads,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
+            ),
+            *(
+                [
+                    self.launch(
+                        give_way,
+                        meeting_threads,
+                        [bank, roads, state, perceived, self.work, self.agents, row_count, meeting_threads, dt],
+                    )
+                ]
+                if self.bank.has_drivers
+                else []
             ),
             self.launch(
                 change_lanes,
@@ -354,8 +375,7 @@ class World:
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """Record a launch, so that its arguments are packed only once."""
-        # `meet` is faster in blocks of 256, the default; `sight` is in the same module, which is compiled for one size
-        block_size = None if self.device == "cpu" or kernel in (scan_all_agents, react_to_agents) else BLOCK
+        block_size = BLOCKS.get(kernel, BLOCK) if self.device != "cpu" else None
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_size, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:

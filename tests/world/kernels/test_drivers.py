@@ -111,6 +111,19 @@ def crossing(start: float) -> Episode:
     return episode(ego(2.0), replace(fast, route=line_route(20.0, 390.0)), slow)
 
 
+def test_the_uniform_driver_and_that_of_the_population_drive_alike_side_by_side() -> None:
+    population = crossing(56.0)
+    uniform = replace(population, agents=tuple(replace(agent, driver=None) for agent in population.agents))
+    worlds = [World(tests, NO_PASSING) for tests in ([uniform, population], [uniform], [population])]
+    assert [world.bank.has_drivers for world in worlds] == [True, False, True]
+    for _ in range(60):
+        for world in worlds:
+            world.step()
+    both, alone = worlds[0].hashes(), [world.hashes()[0] for world in worlds[1:]]
+    assert both == alone
+    assert both[0] != both[1]
+
+
 def test_who_gives_way_leaves_a_margin_and_stops_beside_the_corridor() -> None:
     world = World([crossing(start) for start in np.arange(54.0, 64.0, 2.0).tolist()], NO_PASSING)
     braking, gap = np.zeros(world.batch), np.full(world.batch, np.inf)

@@ -357,8 +357,11 @@ class Ego:
 class Work:
     """Pairs of agents that a step must look at more closely; rebuilt in every step."""
 
-    count: wp.array(dtype=wp.int32)  # [1]
+    count: wp.array(dtype=wp.int32)  # [2] entries of `pair` and of `meeting`
     pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)
+    # (scene * A + who) * A + whom, of drivers of the population that look whether their paths meet
+    meeting: wp.array(dtype=wp.int32)
+    crossing: wp.array(dtype=wp.float32)  # m/s^2 of reaction to it as a leader, unless it is out of the way by then
     # [B, A] whom an Autopilot follows: gap in cm * LEADERS + row of `PerceivedAgents`, or NO_LEADER
     leader: wp.array2d(dtype=wp.int32)
     # [B, A] factor of the gaps that a driver judges, and 1 while it makes an error (late, and blind to priority)

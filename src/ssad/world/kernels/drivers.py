@@ -159,13 +159,13 @@ def driver_speed(roads: Roads, route: wp.vec2i, at: int, own_speed: float, pace:
     """Return the speed from which the driver reaches every bend ahead at its speed there, slowing down early."""
     slope = 2.0 * SLOWING * deceleration
     reach = wp.min(own_speed * own_speed / slope + 8.0, LOOKS)
-    target = pace * roads.rule[route[0] + at][0]
+    squared_speed = float(FAR)
     for sample in range(SAMPLES):
         metres = int(reach * float(sample + 1) / float(SAMPLES))
         point = wp.min(at + metres, route[1] - 1)
         cap = pace * roads.rule[route[0] + point][0]
-        target = wp.min(target, wp.sqrt(cap * cap + slope * float(point - at)))
-    return target
+        squared_speed = wp.min(squared_speed, cap * cap + slope * float(point - at))
+    return wp.min(pace * roads.rule[route[0] + at][0], wp.sqrt(squared_speed))
 
 
 @wp.func

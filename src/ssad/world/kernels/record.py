@@ -71,7 +71,8 @@ def contact(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents:
     """Find the contacts of all agents; wake sleeping traffic."""
     b, first = wp.tid()
     if b == 0 and first == 0:
-        work.count[0] = 0  # for the next step's `sight`
+        work.count[0] = 0  # for the next step's `scan_all_agents`
+        work.count[1] = 0
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
             look_for_contacts(bank, roads, state, b, i, agents)

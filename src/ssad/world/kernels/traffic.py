@@ -29,15 +29,10 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.drivers import (
     BEYOND_LINE,
-    CREEPS,
-    FIRM,
     RUNS_RED,
     STAYS_BELOW,
     STOPS_AT_YELLOW,
-    YIELD_LEAST,
-    driver_arrives_after,
     driver_follows,
-    driver_power,
     driver_speed,
     driver_stops,
     driver_yields,
@@ -50,8 +45,6 @@ from ssad.world.kernels.drivers import (
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, is_changing_lane, way_frame
 from ssad.world.kernels.meeting import (
     ALIGNED,
-    Meeting,
-    find_meeting,
     forecast_pose,
 )
 from ssad.world.kernels.shared import (
@@ -81,37 +74,11 @@ CLOSED_UP = wp.constant(3.0)  # m
 LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 APPROACH = wp.constant(25.0)  # m before a junction from which drivers look at crossing traffic
-PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
-SOON_THERE = wp.constant(5.0)  # s until then
-LETS_BELOW = wp.constant(1.5)  # m/s of a driver that starts
-TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
-WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
 BACKS_TIME = wp.constant(2.0)  # s for which a driver expects somebody to go on backwards
-PARALLEL = wp.constant(0.9)  # cosine of two headings
-STOPS_THERE = wp.constant(0.5)  # m/s^2
-STARTS = wp.constant(0.3)  # m/s^2 of it
 LONGER = wp.constant(6)  # strides beyond the forecast
-RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
-MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
-UNSURE = wp.constant(0.06)  # s/m: the further away, the more of it
-LEAST_MARGIN = wp.constant(0.3)  # s of it, of who has priority
-AFTERWARDS = wp.constant(0.3)  # s between somebody who was let pass and the driver
-COVERED = wp.constant(0.05)  # s: sooner, the other one is in the way already
 CROSSES = wp.constant(1.0)  # m/s of somebody in the way who is going to leave it
-STARTS_BELOW = wp.constant(0.3)  # m/s
-START_TIME = wp.constant(0.7)  # s that a start from rest takes longer: reaction, and jerk
-PICKS_UP_SHARE = wp.constant(0.8)  # of its acceleration, that a driver reckons with
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
-STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in the way of who passes
-JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
-ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
-TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
-HOLDS = wp.constant(0.3)  # share of its acceleration, and m/s^2
-DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a driver that relies on somebody waits
-WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
-BRAKES = wp.constant(1.0)  # m/s^2
-AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
 BESIDE_CYCLIST = wp.constant(1.0)  # m to the side that a driver leaves to a cyclist; else it follows
 NARROW = wp.constant(0.5)  # m: half the width of who passes a cyclist as a cyclist does
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
@@ -252,6 +219,20 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
     """
     rule = row(roads.rule, first)
     return wp.min(rule[1], rule[2]) - part - half
+
+
+@wp.func
+def waiting_line(roads: Roads, first: int, part: float, half: float, waited: float) -> float:
+    """Return `line_ahead` of an agent that reacts to others; -FAR for who is locked in a junction.
+
+    waited: s that it has stood.
+    """
+    line = line_ahead(roads, first, part, half)
+    if line > -1.0 and roads.rule[first][2] <= 0.0:
+        # in the junction, and so short that its front seems to be before it
+        if waited > LOCKED:
+            line = -FAR
+    return line
 
 
 @wp.func
@@ -518,6 +499,14 @@ def cannot_meet(
 
 
 @wp.func
+def add_meeting(work: Work, code: int, crossing_react: float):
+    """List a pair whose driver of the population foresees whether it would meet the other agent; see `Work`."""
+    slot = wp.atomic_add(work.count, 1, 1)
+    work.meeting[slot] = code
+    work.crossing[slot] = crossing_react
+
+
+@wp.func
 def scan_agents(
     bank: EpisodeArrays,
     roads: Roads,
@@ -631,16 +620,20 @@ def scan_agents(
     # a driver of the population looks at crossing traffic in some steps only, and keeps in mind what it saw
     looks_aside = style[0] == 0.0 or looks_at_crossing(state, b, i)
     for j in range(from_row, to_row):
-        if j != i and perceived.kind[b, j] != AgentKind.NONE and not is_natural_walker(bank, e, j):
+        if j != i and perceived.kind[b, j] != AgentKind.NONE:
             box = perceived.span[b, j]
             if not looks_aside:
                 here = perceived.pose[b, j]
                 box = wp.vec4(here[0], here[1], here[0], here[1])
-            last_pose = perceived.forecast[b, j, HORIZON - 1]
-            if looks_aside and extra > 0:
-                last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
-                box = extend_box(box, last_pose)
-            if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
+            elif extra > 0:
+                box = extend_box(box, forecast_pose(perceived, b, j, HORIZON - 1 + extra))
+            if (
+                box[0] < box_high[0]
+                and box[2] > box_low[0]
+                and box[1] < box_high[1]
+                and box[3] > box_low[1]
+                and not is_natural_walker(bank, e, j)
+            ):
                 other_half = perceived.half[b, j]
                 other_pose = perceived.pose[b, j]
                 dx = other_pose[0] - pose[0]
@@ -670,15 +663,21 @@ def scan_agents(
                     reach = half_width
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own_body[0] + other_half[0] + 2.0
+                    last_pose = perceived.forecast[b, j, HORIZON - 1]
+                    if extra > 0:
+                        last_pose = forecast_pose(perceived, b, j, HORIZON - 1 + extra)
                     if not cannot_meet(
                         pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach, last_pose
                     ):
                         flags = flags + 2
                 if flags > 0 and wp.abs(perceived.height[b, j] - perceived.height[b, i]) > BRIDGE:
                     flags = 0  # one of us is on a bridge
-                if flags > 0:
+                code = (b * agents + i) * rows + j
+                if flags == 2 and style[0] > 0.0:
+                    add_meeting(work, code, 0.0)
+                elif flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
-                    work.pair[slot] = ((b * agents + i) * rows + j) * 4 + flags
+                    work.pair[slot] = code * 4 + flags
 
 
 @wp.func
@@ -718,150 +717,7 @@ def waits_at_line(
     return waits
 
 
-@wp.func
-def meet_driver(
-    bank: EpisodeArrays,
-    roads: Roads,
-    state: State,
-    perceived: PerceivedAgents,
-    b: int,
-    i: int,
-    j: int,
-    e: int,
-    agents: int,
-    lon: float,
-    margin: float,
-    goes_first: bool,
-) -> Meeting:
-    """Return where a driver of the population would meet an agent if it went on as it likes; see `find_meeting`."""
-    style = bank.style[e, i]
-    route = bank.route[e, i]
-    own_body = bank.body[bank.model[e, i]]
-    speed = wp.max(state.speed[b, i], 0.0)
-    place = state.progress[b, i]
-    aim = state.aim[b, i]
-    soon = route[0] + wp.min(place + AHEAD, route[1] - 1)
-    start = float(0.0)
-    if speed < STARTS_BELOW:
-        start = START_TIME
-    top_speed = wp.min(aim[1], bank.manner[e, i][0] * roads.rule[soon][0])
-    motion = wp.vec4(speed, PICKS_UP_SHARE * driver_power(speed, style), top_speed, start)
-    rule = row(roads.rule, route[0] + place)
-    extra = looks_longer(rule, aim[0] - float(place), own_body[0], speed, style)
-    before = wp.vec2(LEAST_MARGIN, 0.0)
-    other_accel = float(0.0)
-    if j < agents:
-        other_accel = state.accel[b, j]
-    if not goes_first:
-        before = wp.vec2(MARGIN, UNSURE)
-    return find_meeting(
-        roads,
-        perceived,
-        b,
-        j,
-        route,
-        state.shift[b, i],
-        aim[0],
-        lon,
-        motion,
-        own_body,
-        perceived.half[b, j],
-        margin,
-        before,
-        other_accel,
-        HORIZON + extra,
-    )
-
-
-@wp.func
-def driver_gives_way(
-    bank: EpisodeArrays,
-    roads: Roads,
-    state: State,
-    perceived: PerceivedAgents,
-    meeting: Meeting,
-    b: int,
-    i: int,
-    j: int,
-    e: int,
-    agents: int,
-    line: float,
-    goes_first: bool,
-    dt: float,
-) -> float:
-    """Return the reaction of a driver of the population to an agent that it would meet.
-
-    line: metres from its front to where it would wait.
-    """
-    style = bank.style[e, i]
-    speed = wp.max(state.speed[b, i], 0.0)
-    other_speed = wp.abs(perceived.speed[b, j])
-    other_accel = float(0.0)
-    if j < agents:
-        other_accel = state.accel[b, j]
-    is_there = meeting.begin < COVERED
-    other_need = float(FAR)
-    if not is_there:
-        other_need = other_speed / (2.0 * meeting.begin)
-    power = driver_power(speed, style)
-    end = meeting.end
-    if is_there and other_accel < -STOPS_THERE and other_speed < -2.0 * other_accel * end:
-        end = FAR  # it may stop in the way
-    early = early_distance(meeting.near, speed, state.accel[b, i], bank.manner[e, i][1], style)
-    stop = early_react(driver_yields(speed, meeting.near, style), driver_yields(speed, early, style), speed, style)
-    comes_after = driver_arrives_after(speed, meeting.near, end + AFTERWARDS, style)
-    react = wp.max(stop, comes_after)
-    if speed * end < meeting.near:
-        react = wp.max(react, -style[3] - power)  # it has passed by then in any case
-    # the other one stops if it goes on to brake a little harder than now
-    stops = other_accel < -0.1 and other_speed < TURNS and other_speed < 2.0 * (BRAKES - other_accel) * meeting.begin
-    stands = other_speed < WAITING and other_accel < STARTS
-    if goes_first and ((stops and other_need < STILL_STOPS) or (stands and other_need < RELIES)):
-        return 0.0  # the other one stops already, or waits
-    if meeting.joins == 1 and perceived.kind[b, j] != AgentKind.WALKER:
-        follows = wp.max(driver_follows(speed, other_speed, wp.max(meeting.gap, 1.0), style), -FIRM - power)
-        lead = meeting.gap + bank.body[bank.model[e, i]][0] + perceived.half[b, j][0]
-        parallel = wp.cos(perceived.pose[b, j][2] - state.pose[b, i][2]) > PARALLEL
-        if line <= -1.0 or is_there or parallel:
-            # where two ways become one, the driver behind makes room; side by side, the one without priority
-            if lead > JOINS or (lead > -JOINS and not goes_first):
-                return wp.min(follows, react)
-            is_ahead = is_there or parallel or (lead < -JOINS and goes_first)
-            if speed < LETS_BELOW and not goes_first and state.aim[b, i][0] < state.shift[b, i][1]:
-                is_ahead = bool(False)  # who begins to change lanes from rest is not ahead yet
-            if is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
-                return 0.0
-        elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
-            # it is going to be ahead: an early lift of the foot is enough
-            return wp.max(follows, -style[3] - power)
-        elif lead > 0.0:
-            react = wp.max(react, follows)
-    if goes_first and (other_need < WARY or (other_need < RELIES and meeting.near < ENTERED)):
-        return 0.0  # the other one can stop
-    if goes_first and other_need < RELIES:
-        return -power - DOUBTS * style[3]  # it should, but does not yet
-    if speed < LETS_BELOW and comes_after < -HOLDS * power:
-        react = wp.min(react, -power - HOLDS)  # it does not start only to stop again
-    if meeting.near < ENTERED and speed > LETS_BELOW and not is_there:
-        # in the stretch already, it goes on if it leaves it in time
-        sooner = meeting.begin
-        if wp.min(speed * sooner + 0.5 * power * sooner * sooner, state.aim[b, i][1] * sooner) > meeting.far:
-            return 0.0
-    need = speed * speed / (2.0 * wp.max(meeting.near - YIELD_LEAST, 0.1))
-    if need > STILL_STOPS and meeting.near < ENTERED and meeting.far < 2.0 * bank.body[bank.model[e, i]][0]:
-        return 0.0  # most of the stretch lies behind
-    if waits_at_line(bank, roads, state, perceived, b, i, j, e, goes_first, line, dt):
-        # rolling beyond the line, it stops where the conflict is
-        if speed * speed < 3.0 * style[3] * (line + 0.5) and line + 1.0 < meeting.near:
-            stop = driver_yields(speed, wp.max(line, 0.0), style)
-            if comes_after < -0.3 * power and speed < CREEPS:
-                react = stop
-            else:
-                react = wp.min(react, wp.max(stop, comes_after))
-    return react
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
 def scan_all_agents(
     bank: EpisodeArrays,
     roads: Roads,
@@ -927,11 +783,7 @@ def react_to_agents(
             judgement = work.judgement[b, i]
         first = route[0] + state.progress[b, i]
         offset = aim[0] - float(state.progress[b, i])
-        line = line_ahead(roads, first, offset, own_body[0])
-        if line > -1.0 and roads.rule[first][2] <= 0.0:
-            # in the junction, and so short that its front seems to be before it
-            if state.waited[b, i] > LOCKED:
-                line = -FAR
+        line = waiting_line(roads, first, offset, own_body[0], state.waited[b, i])
         c = wp.cos(pose[2])
         s = wp.sin(pose[2])
         longitudinal = (other_pose[0] - pose[0]) * c + (other_pose[1] - pose[1]) * s
@@ -1026,30 +878,12 @@ def react_to_agents(
                     else:
                         react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
         if flags >= 2 and leads == 0:
-            margin = 0.4
-            if walks:
-                margin = 1.0
             if style[0] > 0.0:
-                goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
-                goes_first = change_priority(perceived, b, i, j, goes_first) or judgement[1] > 0.0
-                if speed < LETS_BELOW and wp.abs(perceived.speed[b, j]) > PASSES:
-                    # who starts lets somebody pass who is about to
-                    other_distance = wp.length(wp.vec2(other_pose[0] - pose[0], other_pose[1] - pose[1]))
-                    if other_distance < SOON_THERE * wp.abs(perceived.speed[b, j]):
-                        goes_first = False
-                meeting = meet_driver(
-                    bank, roads, state, perceived, b, i, j, e, agents, longitudinal, margin, goes_first
-                )
-                if meeting.begin > COVERED:
-                    react = wp.min(react, crossing_react)
-                if meeting.near < FAR:
-                    react = wp.min(
-                        react,
-                        driver_gives_way(
-                            bank, roads, state, perceived, meeting, b, i, j, e, agents, line, goes_first, dt
-                        ),
-                    )
+                add_meeting(work, work.pair[slot] / 4, crossing_react)
             else:
+                margin = 0.4
+                if walks:
+                    margin = 1.0
                 gap = conflict_gap(
                     roads, perceived, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin
                 )
