@@ -331,6 +331,7 @@ def _put_agent(  # noqa: PLR0917
     a["manner"][e, i] = 1.0, 0.0, 0.0, 0.0
     driver = agent.driver
     if driver is not None:
+        a["population"][e] = 1
         a["style"][e, i] = driver.time_gap, driver.standstill_gap, driver.acceleration, driver.deceleration
         a["manner"][e, i] = driver.pace, driver.jerk, driver.reaction_time, driver.estimation_error
         a["habit"][e, i] = driver.lane_offset, driver.errors, driver.key
@@ -416,6 +417,7 @@ def build(  # noqa: PLR0917
         "controller": np.zeros(shape, np.int32),
         "start": np.zeros((*shape, 4), np.float32),
         "style": np.zeros((*shape, 4), np.float32),
+        "population": np.zeros(len(episodes), np.int32),
         "manner": np.zeros((*shape, 4), np.float32),
         "habit": np.zeros((*shape, 3), np.float32),
         "courtesy": np.zeros((*shape, 2), np.float32),

@@ -144,6 +144,7 @@ class EpisodeArrays:
     manner: wp.array2d(dtype=wp.vec4)
     habit: wp.array2d(dtype=wp.vec3)  # [E, A] driver: place left of the lane's middle m, errors an hour, key
     courtesy: wp.array2d(dtype=wp.vec2)  # [E, A] driver: politeness (MOBIL), s that a lane change takes
+    population: wp.array(dtype=wp.int32)  # [E] 1: somebody has a driver of the population
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows

@@ -79,7 +79,7 @@ LONGER = wp.constant(6)  # strides beyond the forecast
 CROSSES = wp.constant(1.0)  # m/s of somebody in the way who is going to leave it
 LETS_TURN = wp.constant(1.0)  # m/s^2 with which a driver lets somebody turn who has entered the junction
 INSIDE = wp.constant(10.0)  # m beyond its line in which a driver still stops for somebody in the junction
-BESIDE_CYCLIST = wp.constant(1.0)  # m that a driver leaves beside a cyclist; where there is less, it follows
+BESIDE_CYCLIST = wp.constant(1.0)  # m to the side that a driver leaves to a cyclist; else it follows
 NARROW = wp.constant(0.5)  # m: half the width of who passes a cyclist as a cyclist does
 PICKS_UP = wp.constant(2.0)  # m/s^2 that an Autopilot expects of itself
 
@@ -242,6 +242,17 @@ def is_in_junction(perceived: PerceivedAgents, b: int, j: int) -> bool:
 
 
 @wp.func
+def has_style(bank: EpisodeArrays, e: int, row_index: int) -> bool:
+    """Return whether the agent of a row has a driver of the population.
+
+    Who plans over a belief does not know who drives the vehicles in it: it expects such drivers where there are any.
+    """
+    if row_index < bank.style.shape[1]:
+        return bank.style[e, row_index][0] > 0.0
+    return bank.population[e] == 1
+
+
+@wp.func
 def is_waiting(
     bank: EpisodeArrays,
     roads: Roads,
@@ -266,12 +277,11 @@ def is_waiting(
     turns = perceived.way[b, j][2] > way[2]
     expected = float(4.0)
     room = wp.max(line, 0.0) + 1.5
-    if i < bank.style.shape[1]:
-        if bank.style[e, i][0] > 0.0:
-            if turns:
-                expected = LETS_TURN
-            else:
-                room = room + INSIDE
+    if has_style(bank, e, i):
+        if turns:
+            expected = LETS_TURN
+        else:
+            room = room + INSIDE
     yields = speed * speed < 2.0 * expected * room
     if turns and index >= 0 and wp.cos(perceived.pose[b, i][2] - perceived.pose[b, j][2]) < -0.5:
         if light(bank, roads, state, perceived, b, me, e, index, dt) == SignalState.GREEN:
@@ -296,9 +306,8 @@ def is_clearing(
     line = perceived.way[b, j][0] - perceived.half[b, j][0]
     speed = perceived.speed[b, j]
     too_late = bool(False)
-    if j < bank.style.shape[1]:
-        if bank.style[e, j][0] > 0.0 and perceived.way[b, j][0] > perceived.way[b, j][1] - 0.5:
-            index = int(-1)  # its line is behind: the next signal is that of another junction
+    if has_style(bank, e, j) and perceived.way[b, j][0] > perceived.way[b, j][1] - 0.5:
+        index = int(-1)  # its line is behind: the next signal is that of another junction
     if index >= 0 and speed * speed >= 8.0 * (wp.max(line, 0.0) + 1.5):
         signal_now = light(bank, roads, state, perceived, b, me, e, index, dt)
         too_late = signal_now == SignalState.YELLOW or signal_now == SignalState.RED
