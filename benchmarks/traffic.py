@@ -323,7 +323,7 @@ def main() -> None:
 
 def compare_with_people(given: argparse.Namespace) -> None:
     """Measure the traffic beside published statistics of human driving; print, and write."""
-    from benchmarks.traffic_human import drive_town, load, show, write_page
+    from benchmarks.traffic_human import drive_town, group_name, load, show, write_page
 
     about = {"world": VERSION, "drivers": given.drivers, "vehicles": given.vehicles, "minutes": given.minutes}
     if given.walkers or given.cyclists:
@@ -349,8 +349,10 @@ def compare_with_people(given: argparse.Namespace) -> None:
             given.json.write_text(json.dumps(about | {"towns": towns}) + "\n", encoding="utf-8")
     show(towns)
     if given.page:
-        stored = [load(file) for file in given.also]
-        write_page({run["drivers"]: run["towns"] for run in [about | {"towns": towns}, *stored]})
+        runs = [load(file) for file in given.also]
+        if towns:
+            runs.insert(0, about | {"towns": towns})
+        write_page({group_name(run): run["towns"] for run in runs})
 
 
 def together(name: str, rows: Sequence[Row]) -> Row:

@@ -420,6 +420,12 @@ def draw(groups: Mapping[str, Sequence[Mapping[str, Any]]], file: Path) -> None:
     plt.close(figure)
 
 
+def group_name(run: Mapping[str, Any]) -> str:
+    """Return what a stored run is called on the page: its drivers, and who else takes part."""
+    others = [f"{run[kind]} {kind}" for kind in ("walkers", "cyclists") if run.get(kind)]
+    return ", with ".join([run["drivers"], *([" and ".join(others)] if others else [])])
+
+
 def write_page(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
     """Write the section of docs/results/traffic.md and its picture."""
     lines: list[str] = []

@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 
 import pytest
+from helpers.template import installed_template
 from rich.console import Console
 
 from ssad.core.errors import ConfigError
@@ -97,12 +98,12 @@ def test_parameters_of_a_class_and_of_the_ego_are_swept_alike(tmp_path: Path) ->
     assert (scenario["parameters"]["ego_speed"], scenario["target_speed"]) == (5.0, 9.0)
 
 
-def test_parameters_of_a_class_of_a_package_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "templates" / "ssad-plugin" / "src")
+def test_parameters_of_a_class_of_a_package_are_swept(tmp_path: Path) -> None:
     sweep = "sweep={speed: [1, 2], gap: {from: 4, to: 6, step: 1}}"
-    plan = plan_of(write(tmp_path), "scenarios=ssad_example.scenario:SCENARIO", sweep)
+    with installed_template(tmp_path / "site"):
+        plan = plan_of(write(tmp_path), "scenarios=ssad_example.scenario:SCENARIO", sweep)
+        walkers = build_requested_episode(plan.cells[-1]).agents[1:]
     assert [cell.fields["sweep.gap"] for cell in plan.cells] == [4.0, 4.0, 5.0, 5.0, 6.0, 6.0]
-    walkers = build_requested_episode(plan.cells[-1]).agents[1:]
     assert {walker.phases[0].speed for walker in walkers} == {2.0}
     assert walkers[1].pose.x - walkers[0].pose.x == pytest.approx(6.0, abs=0.5)
 
