@@ -3,8 +3,8 @@
 `python -m benchmarks.crossing_traffic --scenarios natural,natural-unselected` prints a table; `frea` too, once it has
 been imported. `--page` writes the table into docs/results/traffic.md.
 
-A schedule is the way of a vehicle that is alone: its route, its speed, its acceleration. It needs no world, so that a
-choice by schedules does not change with the rules of the traffic.
+A schedule is the drive of a vehicle without other traffic: along its route, at its speed and acceleration. It needs no
+world, so a choice by schedules does not change with the rules of the traffic.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ssad.world.world import World
 PICK_UP = 2.5  # m/s^2 with which the ego is expected to start: the Autopilot's
 TO_THE_SIDE = 2.5  # m/s^2 in bends
 WITHIN = 4.0  # s between two at the same place that count as an encounter
-ACROSS = 0.5  # rad between the way of the ego and who crosses it
+ACROSS = 0.5  # rad between the paths of the ego and a crossing vehicle
 BEND = 5.0  # m over which the curvature of a route is averaged: a kink between two lanes is no bend
 
 
@@ -119,9 +119,9 @@ def scheduled_crossings(episode: Episode, step: float = 0.1) -> int:
 
 
 def crossings(episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph]) -> npt.NDArray[np.intp]:
-    """Return how many vehicles of each episode cross the ego's way in the world, where nobody drives the ego.
+    """Return how many vehicles of each episode cross the ego's path in a world without the ego.
 
-    Traffic wakes as if the ego kept its schedule, but nobody sees one.
+    Traffic wakes as if the ego kept its schedule, but does not see it.
     """
     world = World(episodes, graphs, ego=Controller.NONE)
     egos = [episode.agents[0] for episode in episodes]

@@ -1,9 +1,9 @@
-"""What generators prove against the Autopilot and PPO: the first table of docs/results/generators.md.
+"""Proven collisions of generators against the Autopilot and PPO: the first table of docs/results/generators.md.
 
 `python -m benchmarks.generators --out RUN --page` runs the suite `adversarial` with each generator against each system
 in SSAD's own natural set and in FREA's, which must have been imported (docs/how-to/import-scenarios.md), keeps the
-shares in benchmarks/results/generators.json, and writes the table. A run that was stopped goes on when the command is
-repeated; `--sets`, `--systems` and `--generators` choose parts, and parts add up. Intervals are of 95 %, a route with
+shares in benchmarks/results/generators.json, and writes the table. Repeat the command to resume a
+run; `--sets`, `--systems` and `--generators` choose parts, and parts add up. Intervals are of 95 %, a route with
 all its draws of traffic is a cluster, and differences to random search are paired by base.
 """
 
@@ -40,7 +40,7 @@ COLUMNS = {
 def measure(
     folder: Path, *, set_name: str, systems: Sequence[str], generators: Sequence[str], budget: int, **options: Any
 ) -> dict[str, Any]:
-    """Run the suite in one set, or go on where it stopped; return the row of each system and generator.
+    """Run the suite in one set, or resume it; return the row of each system and generator.
 
     Args:
         folder: Folder of the runs.

@@ -50,7 +50,7 @@ SIGN_TOWNS: Mapping[str, int] = {"Oldmarket": 12, "Larkhill": 12}
 TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
 """Learned drivers are trained here, on none of the towns that the other sets are in."""
 LANE_TOWNS = ("Random4", "Random11", "Random13", "Random14", "Random15", "Random20")
-"""The first random towns with two lanes a direction: FREA is trained here, beside others who drive its ego's way."""
+"""The first random towns with two lanes a direction: adversaries learn here too, on lanes beside the ego's."""
 Turn = Literal["left", "straight", "right"]
 # Trigger distances, m, at which an ego that does not react is hit at any speed from 8 to 10 m/s on these roads. The
 # others keep SafeBench's value, which is the default of their class.

@@ -1,4 +1,4 @@
-"""What human errors of drivers cause: `python -m benchmarks.traffic_errors --towns Crossgate --hours 100 --page`.
+"""Contacts that human errors cause: `python -m benchmarks.traffic_errors --towns Crossgate --hours 100 --page`.
 
 Drives the scenes of `benchmarks.traffic` with the population of drivers at several rates of errors, the same vehicles
 at each, and counts the errors that are made and the contacts. `--page` writes the table of docs/results/traffic.md.

@@ -4,8 +4,8 @@ Drives one scene as `benchmarks.traffic` does, with drivers of the population, w
 busiest junctions side by side: lanes, stop lines in the colour of their signal, brake lights, turn signals, the number
 and the speed of each agent, and the clock. The recorded drive lies beside the film (`TOWN.npz`) and is used again:
 `--at X,Y` shows another place, `--agent N` goes with an agent, `--whole` shows the town, `--begin S --end S` take a
-part, and `--sheet S` writes pictures S seconds apart on one sheet instead of a film. The command prints what is worth a
-look: contacts, bodies that nearly touch, hard braking, starts on red, vehicles that stand although nothing holds them.
+part, and `--sheet S` writes pictures S seconds apart on one sheet instead of a film. The command prints conspicuous
+moments: contacts, bodies that nearly touch, hard braking, starts on red, vehicles that stand without a reason.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from ssad.world.roads import load_town
 from ssad.world.world import VERSION, World
 
 ROUTES = 200  # of a town, from which each vehicle takes one
-LENGTH = 9000.0  # m of a route: nobody arrives
+LENGTH = 9000.0  # m of a route, too long for a vehicle to arrive
 BRAKES = 0.4  # m/s^2 from which the brake lights are on
 AREA = 30.0  # m around the middle of a junction within which vehicles count for it
 VIEWS = 4  # junctions of a film
 VIEW = (960, 540)  # pixels of a view
 VIEW_WIDTH = 100.0  # m that a view shows from left to right
-HARD = 4.0  # m/s^2 of braking worth a look
-NEAR = 0.3  # m between two bodies worth a look
-IDLE = 15.0  # s at rest worth a look, if no signal, leader or junction explains them
-PAST_LINE = 2.5  # m beyond its stop line at which the front of a vehicle has left its place
-LATE = 1.5  # s of red after which nobody who came at yellow is left
+HARD = 4.0  # m/s^2 of braking that is reported
+NEAR = 0.3  # m between two bodies that is reported
+IDLE = 15.0  # s at rest that are reported, if no signal, leader or junction explains them
+PAST_LINE = 2.5  # m between the stop line and the front of a vehicle that has started
+LATE = 1.5  # s of red after which vehicles that entered at yellow have passed
 CREEPS = 0.6  # m/s
 SHORT_STOP = 2.0  # s
-OPEN = 20.0  # m to the next leader or line, from which nothing holds a vehicle
+OPEN = 20.0  # m to the next leader or line, from which a vehicle is free to go
 BRAKE_LIGHT, TURN_LIGHT, CLOCK = (255, 40, 40), (255, 214, 0), (30, 41, 59)
 CROSSWALK, ROUND = (214, 214, 206), 4  # OpenCV draws at 1/16 pixel
 SUBPIXELS = 1 << ROUND
@@ -280,7 +280,7 @@ def frames(views: Sequence[View], drive: Drive, steps: Sequence[int], agent: int
 
 
 def remarks(graph: LaneGraph, drive: Drive) -> list[tuple[float, str]]:
-    """Return what is worth a look after the settling time: time in s, and agents, places and values in one line."""
+    """Return the conspicuous moments after the settling time: time in s, and agents, places and values in one line."""
     lines: list[tuple[float, str]] = []
     dt, steps = float(drive.dt[0]), len(drive.speed)
     moves = drive.kind != AgentKind.WALKER
@@ -331,7 +331,7 @@ def summary(drive: Drive) -> str:
 
 
 def _red_starts(graph: LaneGraph, drive: Drive) -> Iterator[tuple[int, int, float]]:
-    """Yield step, agent and s of red where somebody drives over a stop line on red, but for turns to the near side."""
+    """Yield step, agent and s of red where a vehicle crosses a stop line on red, except for turns to the near side."""
     forward = np.stack([np.cos(drive.pose[..., 2]), np.sin(drive.pose[..., 2])], axis=-1)
     front = drive.pose[..., :2] + 0.5 * drive.size[:, 0, None] * forward
     near_side = 1 if graph.left_hand[0] else -1

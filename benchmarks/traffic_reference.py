@@ -1,7 +1,7 @@
 """Reference of `realism` and library of `cat`, made from the same drives: `python -m benchmarks.traffic_reference`.
 
-Drives the set `natural-unselected` with the Autopilot and another draw of traffic than any search has, and writes what
-its motor vehicles do: the features of their motions (`ssad.metrics.realism`), and motions of 8 s
+Drives the set `natural-unselected` with the Autopilot and another draw of traffic than any search has, and writes the
+motions of its motor vehicles: their features of their motions (`ssad.metrics.realism`), and pieces of 8 s
 (`ssad.scenarios.dynamic.transition.cat`). `--scenarios` takes another set or file and `--folder` another place, such as
 for traffic of your own. About a minute on one core.
 """

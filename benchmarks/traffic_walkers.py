@@ -1,4 +1,4 @@
-"""Walkers and cyclists in traffic beside published statistics: `python -m benchmarks.traffic --human --walkers 18`."""
+"""Walkers and cyclists in traffic beside published statistics: `python -m benchmarks.traffic --human --walkers 16`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ssad.world.roads.sidewalks import sidewalk_network
 from ssad.world.world import World
 
 NEAR = 12.0  # m around a crossing within which vehicles count for post-encroachment times
-WAITED = 0.5  # s: whoever stood for a shorter time did not wait
+WAITED = 0.5  # s; a shorter stop is no wait
 ABREAST = 0.9  # cosine of the headings of a cyclist and a vehicle that passes it
 BESIDE = 3.5  # m between the bodies of a cyclist and a vehicle on the lane beside it
 BESIDE_PUBLISHED = {

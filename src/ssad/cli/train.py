@@ -157,15 +157,15 @@ def train_feasible_region(
     scenarios: Annotated[
         str, typer.Option(help="Comma-separated sets or files with background traffic to record drives in.")
     ] = "training,training-lanes",
-    egos: Annotated[str, typer.Option(help="Comma-separated driving systems at the wheel, in turn.")] = "autopilot,ppo",
+    egos: Annotated[str, typer.Option(help="Comma-separated driving systems of the ego, used in turn.")] = "autopilot,ppo",
     adversaries: Annotated[
-        str, typer.Option(help="Comma-separated shipped adversaries in their way, in turn; none: natural traffic.")
+        str, typer.Option(help="Comma-separated shipped adversaries, used in turn; none: natural traffic.")
     ] = "adv-ppo-paper,adv-ddpg,none",
     out: Annotated[Path, typer.Option(help="Output folder.")] = Path("training"),
     change: Changes = None,
     device: Annotated[str, typer.Option(help="Where the networks are trained: cpu or cuda.")] = "cpu",
 ) -> None:
-    """Learn offline which states leave the ego a way out: the second critic of the adversary frea."""
+    """Learn the feasible region offline: the states in which the ego can still avoid a collision."""
     paths.check_out(out, paths.TRAINING)
     from ssad.training.detector import parse_changes
     from ssad.training.feasibility import RegionPlan, run_region_training

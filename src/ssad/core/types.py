@@ -524,12 +524,12 @@ class WalkStyle:
 
     Attributes:
         crossings: Roads that it crosses on its way, in order.
-        margin: Time between itself and a vehicle with which it is content when it enters a road, s.
-        room: Half width that its way offers to it, m.
+        margin: Time that it demands of a gap in traffic beyond the time to cross, s.
+        room: Half width of the pavement that it can use, m.
         offset: Mean place left of the middle of the pavement, m.
-        group: Name of the walker that decides when its group crosses; "": it decides itself.
-        row: Distance at which it walks behind that one, m.
-        depth: Distance from it to the last one that follows it, m.
+        group: Name of the leader that decides when the group crosses; "": the walker decides itself.
+        row: Distance at which it walks behind the leader, m.
+        depth: Distance from a leader to the last walker of its group, m.
     """
 
     crossings: tuple[WalkCrossing, ...] = ()

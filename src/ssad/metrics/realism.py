@@ -192,7 +192,7 @@ def traffic_reference(path: Path = REFERENCE) -> dict[str, F64]:
         Feature -> values, as for `realism` and `wasserstein`; of continuous features 500 quantiles.
 
     Raises:
-        FormatError: The file is none.
+        FormatError: The file is no reference.
     """
     data = safeio.read_json(path)
     values = data.get("values") if isinstance(data, dict) else None

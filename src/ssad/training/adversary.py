@@ -1,4 +1,4 @@
-"""`ssad train adversary`: Adv.PPO, a policy that drives background vehicles into the ego's path, with its card."""
+"""`ssad train adversary`: policies that drive background vehicles and provoke collisions of the ego, with cards."""
 
 from __future__ import annotations
 
@@ -68,16 +68,16 @@ ADVERSARIES = {
         validate=25_000,
     ),
 }
-"""How adversaries are trained: for proven collisions, but for `adv-ppo-paper`, which is the paper's Adv.PPO."""
+"""Recipes of adversaries. All seek proven collisions, except `frea` (lawful) and `adv-ppo-paper` (the paper's)."""
 SCENARIOS = {name: ("training", "training-lanes") for name in ADVERSARIES if name != "adv-ppo-paper"}
-"""What they learn in unless told otherwise, where that is not the set `training`."""
+"""Default training sets, where they are not `training` alone."""
 ROAD_COSTS = {"adv-ppo-paper": 0.0}
-"""What a step off the road costs unless told otherwise, where that is not `ROAD_COST`."""
+"""Default costs of a step off the road, where they are not `ROAD_COST`."""
 ROAD_COST = 0.5
 WITH_REGION = ("frea",)
 """Adversaries that have the feasible region as a critic."""
 REWARDS = ("adversary", "colliding", "feasible", "lawful", "proving")
-"""What they may learn from; see `ssad.training.adversary_env`."""
+"""Names of the rewards; see `ssad.training.adversary_env`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class AdversaryPlan:
     Attributes:
         algorithm: A name of `ADVERSARIES`.
         out: Folder to write to.
-        ego: Driving system under attack.
+        ego: Driving system under test.
         scenarios: Training scenarios with natural traffic; empty: the default of the algorithm (`SCENARIOS`, or
             `training`).
         test: Scenarios of the final test.

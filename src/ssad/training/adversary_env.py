@@ -1,4 +1,4 @@
-"""One adversary a scene as a vector environment of stable-baselines3: the ego and everybody else are part of it."""
+"""Vector environment of stable-baselines3 with one adversary in each scene; all other agents are part of it."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _ADVERSARY = 1_000  # index of the adversaries' driver, beyond those of the loop
 
 
 class Conduct:
-    """Whether the adversary of each scene has kept to what a proven collision asks of it since it was selected.
+    """Record of whether each adversary has met the conditions of a proven collision since it was selected.
 
-    It must not drive against traffic for 0.3 s, nor now; not leave the road; not turn harder than its tyres allow; and
-    touch nobody but the ego. See `ssad.metrics.proven_collisions`.
+    It must not drive against traffic for 0.3 s or at present, leave the road, turn harder than its tyres allow, or
+    touch another agent than the ego. See `ssad.metrics.proven_collisions`.
     """
 
     def __init__(self, scenes: int, *, dt: float) -> None:
@@ -57,12 +57,12 @@ class Conduct:
         self._was_on_road = np.zeros(scenes, bool)
 
     def begin(self, scenes: npt.ArrayLike) -> None:
-        """Forget what was, in scenes with another adversary."""
+        """Start anew in scenes with another adversary."""
         index = np.asarray(scenes)
         self._wrong_steps[index], self._is_flawed[index], self._was_on_road[index] = 0, False, False
 
     def record(self, state: WorldState, agents: I32, alignment: F32, previous_yaw: F32) -> Bool:
-        """Record a step; return [N] whether the adversaries have kept to it until now.
+        """Record a step; return [N] whether the adversaries have met the conditions until now.
 
         Args:
             state: After the step.

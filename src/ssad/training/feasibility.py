@@ -1,4 +1,4 @@
-"""`ssad train feasible-region`: which states leave the ego a way out, learned offline from recorded drives.
+"""`ssad train feasible-region`: the states in which the ego can avoid a collision, learned offline from drives.
 
 The region is the zero sublevel set of a value V of the ego's state: V <= 0 where some driving in the data keeps the ego
 clear of others, V > 0 where none does. It is learned without a simulator: twin critics Q regress to the discounted
@@ -64,19 +64,19 @@ class RegionRecipe:
     Attributes:
         transitions: Steps of egos that are recorded.
         steps: Gradient steps.
-        scenes: Scenes side by side while recording.
+        scenes: Parallel scenes while recording.
         draws: Episodes of each scenario.
-        evasions: Chance of a step to begin an evasion, which goes on for 0.5 to 2 s.
-        hidden: Widths of the layers between.
-        lr: Learning rate; falls to zero, evenly.
+        evasions: Chance that an evasion of 0.5 to 2 s begins in a step.
+        hidden: Widths of the hidden layers.
+        lr: Learning rate; falls linearly to zero.
         gamma: Discount of a step.
         unsafe: h while bodies touch. A state is infeasible where the discounted chance of a contact is above
             1 / (1 + unsafe). FREA has 18; its adversaries hit less often, and in these drives that would make 94 % of
             the states infeasible.
-        expectile: Weight of a Q below V; that of one above is the rest to 1.
+        expectile: Weight of a Q below V; a Q above V has the weight 1 - expectile.
         tau: Share of the critics that their targets take over at each step.
         batch: Transitions of a gradient step.
-        seed: Of all random draws.
+        seed: Seed of all random draws.
     """
 
     transitions: Whole = 400_000
@@ -101,8 +101,8 @@ class RegionPlan:
     Attributes:
         out: Folder to write to.
         scenarios: Sets and files with background traffic.
-        egos: Driving systems at the wheel, in turn.
-        adversaries: Weights of adversaries in their way, in turn; "none" for natural traffic.
+        egos: Driving systems of the ego, used in turn.
+        adversaries: Weights of adversaries, used in turn; "none": natural traffic.
         changes: Changed values of the recipe.
         device: Device of the networks.
     """
@@ -174,10 +174,10 @@ class Transitions:
 
 
 def region_states(state: WorldState, scenes: I32, agents: I32 | None = None) -> F32:
-    """Return what the feasible region is a function of, [N, 18], in the frame of the ego.
+    """Return the input of the feasible region, [N, 18], in the frame of the ego.
 
-    Rows of x, y, length, width, heading and speed of the ego, of an adversary, and of the vehicle nearest to the ego
-    apart from that; zeros for who is not there or is more than 25 m away.
+    Rows of x, y, length, width, heading and speed of the ego, of an adversary, and of the nearest other vehicle; zeros
+    for a vehicle that is absent or more than 25 m away.
 
     Args:
         state: State of the world.
@@ -230,21 +230,21 @@ def record_transitions(
     evasions: float,
     seed: int,
 ) -> Transitions:
-    """Record steps of an ego that now and then evades at random, with an adversary or without.
+    """Record steps of an ego that evades at random from time to time, with or without an adversary.
 
     Args:
         episodes: Episodes of the scenes.
         graphs: Lane graphs of their towns.
         ego: Driver of the ego.
         adversary: Driver of the agents that FREA's rules select; None: no adversaries.
-        count: Transitions at least.
-        scenes: Scenes side by side.
-        evasions: Chance of a step to begin an evasion.
-        seed: Of the draws of episodes and evasions.
+        count: Minimum number of transitions.
+        scenes: Parallel scenes.
+        evasions: Chance that an evasion begins in a step.
+        seed: Seed of the draws of episodes and evasions.
 
     Returns:
-        Transitions in which another vehicle is within 25 m. A contact is followed by one of its own, from the state of
-        the contact, with which the drive ends.
+        Transitions in which another vehicle is within 25 m. A contact adds a last transition, from and to the state of
+        the contact.
     """
     random = generator("feasible region", seed)
     world = World(episodes, graphs, assign=np.arange(scenes) % len(episodes))
@@ -350,7 +350,7 @@ def train_region(
 
 
 def measure_region(region: FeasibleRegion, data: Transitions) -> dict[str, float]:
-    """Return how a region judges recorded drives.
+    """Return the shares of recorded states that a region calls infeasible.
 
     Returns:
         infeasible: share of all states with V > 0; touching: that of states in which bodies touch; apart: that of

@@ -1,7 +1,7 @@
-"""PPO with a feasible region as a second critic: the adversary seeks its goal while the ego has a way out.
+"""PPO with a feasible region as a second critic: the adversary seeks its goal while the ego can avoid a collision.
 
-Where the region says that the ego has none, before a step or after it, the step counts by how much it gave back instead
-of by its reward. Needs stable-baselines3.
+If the ego is outside the region before or after a step, the step counts by the decrease of the region's value instead
+of its reward. Needs stable-baselines3.
 
 Source: FREA (Chen et al. 2024, arXiv 2406.02983), the advantage of its constrained policy optimisation.
 """
@@ -20,7 +20,7 @@ from ssad.training.adversary_env import AdversaryEnv
 
 
 class FeasibleBuffer(RolloutBuffer):  # type: ignore[misc]  # stable-baselines3 may not be installed
-    """Rollout buffer whose advantages are those of the reward or of the feasible region, each in unit spread.
+    """Rollout buffer with advantages of the reward or of the feasible region, each with unit standard deviation.
 
     Args:
         environment: Environment that the steps come from; it must have a feasible region.
@@ -44,7 +44,7 @@ class FeasibleBuffer(RolloutBuffer):  # type: ignore[misc]  # stable-baselines3 
         super().add(*arguments, **options)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: npt.NDArray[Any]) -> None:
-        """Compute the returns as ever, and the advantages from reward and region."""
+        """Compute the returns of the reward, and the advantages of reward and region."""
         super().compute_returns_and_advantage(last_values, dones)
         before, after = self.region_values[:, 0], self.region_values[:, 1]
         starts = np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
@@ -57,14 +57,14 @@ class FeasibleBuffer(RolloutBuffer):  # type: ignore[misc]  # stable-baselines3 
 
 
 def compose_advantages(reward: F32, feasibility: F32, before: F32, after: F32, is_driven: npt.NDArray[np.bool_]) -> F32:
-    """Return the advantages [T, N] of steps: those of the reward where the ego has a way out before and after.
+    """Return the advantages [T, N] of steps: those of the reward where the ego is in the region before and after.
 
     Args:
         reward: [T, N] advantages of the reward.
-        feasibility: [T, N] advantages of the region: how much value the steps from here on give back.
-        before: [T, N] value of the region before each step; above 0 the ego has no way out.
+        feasibility: [T, N] advantages of the region: decrease of its value from this step on.
+        before: [T, N] value of the region before each step; above 0 the ego is outside.
         after: [T, N] the same after it.
-        is_driven: [T, N] whether there was an adversary; the advantage is 0 elsewhere.
+        is_driven: [T, N] whether the scene had an adversary; the advantage is 0 elsewhere.
     """
     scaled = []
     for values in (reward, feasibility):

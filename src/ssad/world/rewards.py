@@ -64,7 +64,7 @@ def driver(state: WorldState) -> F64:
 def lane(state: WorldState) -> F64:
     """A reward that keeps drivers on their route, [B]: `driver`, and -1.5 for each metre beyond half a metre from it.
 
-    Without that, policies cut left turns by 2 to 3 m, into those who wait there.
+    Without that, policies cut left turns by 2 to 3 m, into waiting vehicles.
     """
     return (
         _ego_reward(state, desired_speed=8.0, collision=100.0, step_reward=0.1, lateral_weight=1.5)
@@ -206,19 +206,19 @@ def cost_of(state: WorldState, agents: I32) -> F64:
 def feasible(state: WorldState, agents: I32, previous_cost: F64, avoided: Bool, *, off_road: float = 0.0) -> F64:
     """The reward of a feasibility-guided adversary, [N]: a contact with the ego counts by who could have avoided it.
 
-    A collision that nobody could avoid says nothing about the ego. So a contact is paid with 30 if a careful driver
-    would have avoided it, and costs 10 if not. On the way there, a metre nearer to the goal brings 0.3; the goal itself
-    brings nothing. Others and the road cost what they cost `adversary`.
+    An unavoidable collision says nothing about the ego. So a contact brings 30 if a careful driver would have avoided
+    it, and costs 10 otherwise. A metre nearer to the goal brings 0.3, and reaching the goal nothing. Contacts with
+    other agents and the road cost as in `adversary`.
 
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
         previous_cost: [N] `distance_to_goal` before the step.
-        avoided: [N] whether a careful driver in the ego's place would have stayed clear; of those who touch the ego.
+        avoided: [N] whether a careful driver in the ego's place would have avoided a contact with the ego.
         off_road: As of `adversary`.
 
-    Source: FREA (Chen et al. 2024), for the aim. FREA learns from recorded drives which states leave a way out, and
-    turns the adversary back where there is none; here the encounter is judged when it is over.
+    Source: FREA (Chen et al. 2024), for the aim. FREA learns a feasible region from recorded drives, and the
+    adversary keeps the ego in it (`ssad.training.feasible_ppo`); here the encounter is judged when it is over.
     """
     scene, agent = agents.T
     progress = np.clip(previous_cost - distance_to_goal(state, agents), -1.0, 1.0)
@@ -289,9 +289,8 @@ def proving(
 ) -> F64:
     """Return the reward of adversaries that seek proven collisions, [N]; see `ssad.metrics.proven_collisions`.
 
-    A contact with the ego is paid with 30 if it proves something, and costs 3 if not. On the way there, a metre
-    nearer to the goal brings 0.3; the goal itself brings nothing. A contact with anybody else costs 15, as in
-    `adversary`.
+    A contact with the ego brings 30 if the collision is proven, and costs 3 otherwise. A metre nearer to the goal
+    brings 0.3, and reaching the goal nothing. A contact with another agent costs 15, as in `adversary`.
 
     Args:
         state: After the step.

@@ -1,4 +1,4 @@
-"""Tables of the walkers of natural traffic: their ways, the crossings, and the routes of vehicles over these."""
+"""Tables for the walkers of natural traffic: their routes, the crossings, and the passages of vehicles over these."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from ssad.world.kernels.data import TurnRank, Walkers, array_types
 from ssad.world.roads.crossings import crossing_axis, road_crossings
 from ssad.world.roads.sidewalks import sidewalk_network
 
-TAIL = 14.0  # m behind its middle that the rear of a vehicle may be on a crossing
-JUST_AFTER = 15.0  # m beyond a turn within which a crossing is one of the road that is entered
+TAIL = 14.0  # m from the middle of a vehicle to its rear, at most
+JUST_AFTER = 15.0  # m beyond a turn within which a crossing belongs to the road that is entered
 EDGE = 1.0  # m beyond the kerb up to which a route leads over a crossing
 
 

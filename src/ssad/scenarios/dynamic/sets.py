@@ -17,11 +17,11 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
 UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs")
-"""Traffic as it comes, for rates and past stop signs; its scenarios belong to no class's own."""
+"""Unselected traffic, for rates and past stop signs. The name of a scenario class does not load these scenarios."""
 UNIFORM = ("natural-uniform",)
-"""The set `natural` of before, to which earlier results refer: uniform drivers, no walkers and no cyclists."""
+"""Former set `natural`, to which earlier results refer: uniform drivers, no walkers and no cyclists."""
 TRAINING = ("training", "training-lanes")
-"""What drivers and adversaries are trained on, in towns that no other set uses; they belong to no class's own."""
+"""Training sets of drivers and adversaries. The name of a scenario class does not load these scenarios."""
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}

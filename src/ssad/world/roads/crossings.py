@@ -1,4 +1,4 @@
-"""Crossings as walkers and drivers meet them: the kerbs, and the signals of the traffic that is crossed."""
+"""Kerbs of crossings, and the signals of the traffic on them."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ssad.world.roads.sidewalks import Crossing, sidewalk_network
 ROADWAY = (LaneType.DRIVING, LaneType.PARKING, LaneType.BIKING)
 NEAR_LINE = 15.0  # m beyond a stop line within which its signal rules a crossing
 NEAR_JUNCTION = 30.0  # m beyond a junction within which its signals do
-LOST_TIME = 1.0  # s after green before the first vehicle comes to a crossing at its stop line
-CLEARANCE = 3.0  # s after green before one has come through the junction
+LOST_TIME = 1.0  # s from green until the first vehicle reaches a crossing at its stop line
+CLEARANCE = 3.0  # s from green until the first vehicle has crossed the junction
 _SAMPLE = 0.1  # m
 
 
 @dataclass(frozen=True)
 class SignalledTraffic:
-    """Traffic over a crossing that a signal lets go.
+    """Lane over a crossing whose traffic a signal controls.
 
     Attributes:
         signal: Signal of the town.
-        low: Distance from the first end of the crossing at which its lane begins, m.
-        high: Distance at which its lane ends, m.
-        seconds: Time that it needs after the beginning of green to come there, s.
+        low: Distance from the first end of the crossing to the near edge of the lane, m.
+        high: Distance to its far edge, m.
+        seconds: Time from the start of green until traffic reaches the crossing, s.
     """
 
     signal: int
@@ -39,11 +39,11 @@ class SignalledTraffic:
 
 @dataclass(frozen=True)
 class RoadCrossing:
-    """What a crossing leads over.
+    """Roadway under a crossing.
 
     Attributes:
         kerbs: Distances from its first end to the edges of the road, m.
-        traffic: Traffic that signals let go; it decides when walkers may cross. Empty: there are no signals.
+        traffic: Signalled lanes, which decide when walkers may cross. Empty: there are no signals.
     """
 
     kerbs: tuple[float, float]
@@ -51,7 +51,7 @@ class RoadCrossing:
 
 
 def road_crossings(graph: LaneGraph) -> tuple[RoadCrossing, ...]:
-    """Return what each crossing of `sidewalk_network` leads over, cached with the lane graph."""
+    """Return the roadway under each crossing of `sidewalk_network`, cached with the lane graph."""
     if "road crossings" not in graph.cache:
         query = LaneQuery(graph)
         graph.cache["road crossings"] = tuple(
@@ -63,7 +63,7 @@ def road_crossings(graph: LaneGraph) -> tuple[RoadCrossing, ...]:
 
 
 def _kerbs(query: LaneQuery, crossing: Crossing) -> tuple[float, float]:
-    """Return where the road under a crossing begins and ends; its ends where no lane is under it."""
+    """Return both edges of the road under a crossing, m; the ends of the crossing if no lane is under it."""
     positions = np.arange(0.0, crossing.length, _SAMPLE)
     points = crossing.xy[0] + np.outer(positions / crossing.length, crossing.xy[1] - crossing.xy[0])
     inside = positions[query.nearest(points, ROADWAY).is_inside]
@@ -71,7 +71,7 @@ def _kerbs(query: LaneQuery, crossing: Crossing) -> tuple[float, float]:
 
 
 def _traffic(graph: LaneGraph, crossing: Crossing) -> list[SignalledTraffic]:
-    """Return the traffic of a crossing that signals let go, without what turns: that yields to walkers."""
+    """Return the signalled lanes under a crossing, without turning traffic, which yields to walkers."""
     axis = (crossing.xy[1] - crossing.xy[0]) / crossing.length
     traffic = []
     for lane in crossing.lanes:
@@ -91,7 +91,7 @@ def _traffic(graph: LaneGraph, crossing: Crossing) -> list[SignalledTraffic]:
 
 
 def _signals_before(graph: LaneGraph, lane: int, place: float) -> dict[int, float]:
-    """Return the signals that let straight traffic come to a place on a lane, and the time that it needs, s."""
+    """Return the signals that release straight traffic to a place on a lane, and its travel time from green, s."""
     real = ~graph.signal_virtual[graph.stop_signal]
     own = np.flatnonzero((graph.stop_lane == lane) & real & (graph.stop_s <= place + 2.0))
     own = own[place - graph.stop_s[own] < NEAR_LINE]

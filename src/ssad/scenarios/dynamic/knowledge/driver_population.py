@@ -1,9 +1,8 @@
 """A population of drivers: parameters drawn from published distributions, with their correlations.
 
 Time gap, gap at rest, acceleration and comfortable deceleration have the means and spreads between those of NGSIM
-US-101 and I-24 MOTION, weighted alike, and the mean of their correlations; desired speed goes with them. What only
-one kind of vehicle has (trucks and buses accelerate less) comes from its model. The values and their sources are in
-`ssad.metrics.human_driving`.
+US-101 and I-24 MOTION, weighted alike, and the mean of their correlations with each other and with desired speed.
+Trucks and buses accelerate less. The values and their sources are in `ssad.metrics.human_driving`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from ssad.world.models import agent_model
 
 _DATA = ("NGSIM US-101, cars, IDM", "I-24 MOTION, cars, IDM")
 _QUANTITIES = ("desired speed", "time gap", "acceleration", "comfortable deceleration", "standstill gap")
-# Limits of what is drawn: those of the fits, and for safety a gap that no driver goes below.
+# Limits of the draws: those of the fits, and a minimum gap for safety.
 _LIMITS = {
     "desired speed": (0.8, 1.2),
     "time gap": (0.8, 2.4),

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 NEAR = 40.0  # m from the route within which walkers and cyclists start
 CLEAR = 15.0  # m around the ego's start without cyclists
-MAX_SPEED_LIMIT = 60.0 / 3.6 + 0.1  # m/s; on faster roads nobody cycles
+MAX_SPEED_LIMIT = 60.0 / 3.6 + 0.1  # m/s; there are no cyclists on faster roads
 SPEED_LIMITS = (0.6, 2.2)  # m/s of walkers
 GROUP_SLOWER = 0.15  # m/s by which groups are slower: the middle of what Gates et al. (2006) measured
 MAX_GROUP = 6  # walkers
@@ -49,19 +49,19 @@ ABREAST = 0.7  # m between the two walkers of a row
 ROW = 1.0  # m between the rows of a group
 START_GAP = 6.0  # m between the starts of groups
 BODIES_APART = 0.3  # m between a walker and anything else at the start
-CROSSING_SHARE = 0.5  # of walkers cross where a sidewalk leads on too: at a corner, to go straight on one has to cross
+CROSSING_SHARE = 0.5  # of walkers that cross although the sidewalk goes on; at corners, straight on means to cross
 MARGINS = (1.0, 3.0)  # s beyond the time to cross: the Highway Capacity Manual (2010) has 3 s, walkers accept less
-KERB = 0.7  # m from the kerb to a walker who waits
-SPARE = 1.2  # times the walk that its time allows, so that nobody comes to its end
+KERB = 0.7  # m from the kerb to a waiting walker
+SPARE = 1.2  # times the distance walked in an episode, so that no walker reaches the end of its way
 ROUTE = 400.0  # m of a cyclist's route
 MAX_DURATION = 600.0  # s of a walk
-SET_OFF = 0.7  # s until a walker who stands has started
-RED_MARGIN = 1.0  # s of red that a walker has to spare, or it never comes over
+SET_OFF = 0.7  # s that a standing walker takes to start
+RED_MARGIN = 1.0  # s of red beyond the time to cross, below which a walker avoids a crossing
 CYCLING_SPREAD = 0.8  # m/s between the speeds of cyclists
 CYCLING_LIMITS = (2.5, 7.0)  # m/s
 CYCLING_ACCELERATION = (0.5, 1.0)  # m/s^2, from the lower half of the published range: the rest is sport
 CYCLING_DECELERATION = (1.2, 2.0)  # m/s^2
-EDGE = (0.6, 1.2)  # m from a cyclist to the edge of its lane
+EDGE = (0.6, 1.2)  # m between a cyclist and the edge of its lane
 BLEND = 12  # m over which a cyclist moves to another place in the lane
 _ATTEMPTS = 20  # places that are tried for each group
 
@@ -117,7 +117,7 @@ def draw_walkers(
         plan: Number of walkers.
         graph: Lane graph of the town; without sidewalks near the route there are no walkers.
         route: The ego's route; None: they start anywhere in the town.
-        others: Agents in whom nobody starts.
+        others: Agents whose bodies stay free of walkers.
         duration: Time for which they walk, s.
         *key: Key of the draw.
 
@@ -181,7 +181,7 @@ def draw_walkers(
 def _members(
     graph: LaneGraph, network: SidewalkNetwork, ways: Sequence[tuple[Walk, float]], group: _Group, first: int
 ) -> Iterator[EpisodeAgent]:
-    """Yield the walkers of a group, its leader first; nobody where one of them would start on a road."""
+    """Yield the walkers of a group, its leader first; none if one of them would start on a road."""
     paths = [(*_metric_way(walk), walk, offset) for walk, offset in ways]
     for member in range(group.size):
         path, crossing, walk, offset = paths[member % len(paths)]

@@ -1,13 +1,13 @@
-"""Adv.PPO: vehicles of the background traffic that a learned policy drives into the ego's way, one or several at once.
+"""Adv.PPO: learned policies that drive vehicles of the background traffic against the ego, one or several at once.
 
     from ssad.scenarios.dynamic.policy.adv_ppo import Adversary
     from ssad.world.selection import FreaSelection
     traces = rollout(world, {0: make_system("autopilot"), FreaSelection(count=1): Adversary()})
 
 An adversary knows its goal, a point 6.5 m ahead of the ego on the ego's own route, and the road around it. It steers,
-accelerates and brakes, and was rewarded for proven collisions (`ssad.world.rewards.proving`). That of the paper seeks
-the goal itself (`ssad.world.rewards.adversary`), sees no road, and drives in reverse instead of braking; it is called
-`adv-ppo-paper`. `ssad train adversary` trains both.
+accelerates and brakes, and was rewarded for proven collisions (`ssad.world.rewards.proving`). The adversary of the
+paper, `adv-ppo-paper`, was rewarded for reaching the goal (`ssad.world.rewards.adversary`). It does not observe the
+road, and reverses instead of braking. `ssad train adversary` trains both.
 
 Source: the paper, equation 6; FREA (Chen et al. 2024), its adversary `ppo`.
 """
@@ -45,7 +45,7 @@ class Adversary(PolicyDriver):
 
 
 class AdvPPO:
-    """Adv.PPO: a learned policy drives the vehicle nearest to the ego, in search of proof; one rollout per base."""
+    """Adv.PPO: a learned policy drives the vehicle nearest to the ego and seeks proven collisions; one rollout a base."""
 
     name = "adv-ppo"
 

@@ -179,7 +179,7 @@ def traffic_motions(path: Path = MOTIONS) -> tuple[F64, F64]:
         Motions [K, LENGTH + 1, 3], x, y, yaw in the frame of their first pose, and their first speeds [K], m/s.
 
     Raises:
-        FormatError: The file is none.
+        FormatError: The file is no library of motions.
     """
     arrays = safeio.load_npz(path)
     if set(arrays) != {"pose", "speed"} or arrays["pose"].shape[1:] != (LENGTH + 1, 3):
