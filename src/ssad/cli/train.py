@@ -157,7 +157,9 @@ def train_feasible_region(
     scenarios: Annotated[
         str, typer.Option(help="Comma-separated sets or files with background traffic to record drives in.")
     ] = "training,training-lanes",
-    egos: Annotated[str, typer.Option(help="Comma-separated driving systems of the ego, used in turn.")] = "autopilot,ppo",
+    egos: Annotated[
+        str, typer.Option(help="Comma-separated driving systems of the ego, used in turn.")
+    ] = "autopilot,ppo",
     adversaries: Annotated[
         str, typer.Option(help="Comma-separated shipped adversaries, used in turn; none: natural traffic.")
     ] = "adv-ppo-paper,adv-ddpg,none",
