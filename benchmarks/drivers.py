@@ -13,8 +13,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from benchmarks.insert import insert
+from benchmarks.insert import DOCS, insert
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import Episode
 from ssad.drivers import LEARNED, make_system
@@ -234,6 +235,17 @@ def page(data: dict[str, Any]) -> None:
         if part in data:
             made = data.get("made", {}).get(part, {})
             insert(f"results/{part}.md", part, [*made_lines(made), *make(data[part])])
+            if made:
+                state_origin(DOCS / "results" / f"{part}.md", list(made.values())[-1])
+
+
+def state_origin(file: Path, origin: Mapping[str, Any]) -> None:
+    """State the commit, weights and torch version of the latest set in the header of a page of stored results."""
+    weights = ", ".join(f"`{system}` {digest}" for system, digest in origin["weights"].items())
+    commit, _, date = origin["commit"].partition(" ")
+    header = f"Commit: {commit[:7]} {date}. Weights: {weights}. Torch: {origin['torch']}. Make"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(re.sub(r"Commit: .*? Make", lambda _: header, text, count=1), encoding="utf-8")
 
 
 def store(path: Path, data: dict[str, Any]) -> None:
