@@ -1,7 +1,7 @@
 """Drivers of the population: how one of them follows, stops, errs and moves the pedals.
 
 Each has parameters of its own: `style`, `manner` and `habit` of `EpisodeArrays`. A reaction is, as in `traffic`, m/s^2
-and negative: here it is the acceleration that somebody or something allows, less the driver's own acceleration.
+and negative: here it is the acceleration that an agent or a place allows, less the driver's own acceleration.
 
 A driver follows by the Intelligent Driver Model with its equilibrium at the desired gap (Treiber and Kesting 2013,
 section 11.3.4), and brakes no harder than the situation needs. Before a stop the deceleration is nearly constant.
@@ -13,38 +13,38 @@ from ssad.world.kernels.data import FAR, Roads, State
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
-LEADER_BRAKES = wp.constant(4.0)  # m/s^2 that a driver reckons a leader may brake with
+LEADER_BRAKES = wp.constant(4.0)  # m/s^2 of braking that a driver allows for in its leader
 STOPS_AT_YELLOW = wp.constant(3.05)  # m/s^2: half of drivers stop (Olson and Rothery 1962: between 2.44 and 3.66)
-RUNS_RED = wp.constant(4.5)  # m/s^2: who would have to brake harder at a signal that has turned red goes on
-BEYOND_LINE = wp.constant(2.0)  # m beyond the stop line, within which who has come to rest waits for green
-STAYS_BELOW = wp.constant(1.5)  # m/s: who is slower beyond the line, stays
-SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a driver brakes who is late
-FIRM = wp.constant(3.5)  # m/s^2: harder braking is no ordinary stop
-RELEASE = wp.constant(1.8)  # times the ordinary jerk, with which the foot leaves the throttle to brake
+RUNS_RED = wp.constant(4.5)  # m/s^2: at a signal that turns red, a driver that would have to brake harder goes on
+BEYOND_LINE = wp.constant(2.0)  # m beyond the stop line within which a driver at rest waits for green
+STAYS_BELOW = wp.constant(1.5)  # m/s below which a driver beyond the line stays
+SMOOTH = wp.constant(1.05)  # times the needed deceleration, with which a late driver brakes
+FIRM = wp.constant(3.5)  # m/s^2 above which braking is no ordinary stop
+RELEASE = wp.constant(1.8)  # times the ordinary jerk, from throttle to brake
 HASTE = wp.constant(1.5)  # m/s^2 of demand up to which the jerk is the ordinary one; beyond, it grows with the demand
-ATTENTIVE = wp.constant(0.3)  # share of the reaction time of one who is ready to brake, or creeps
+ATTENTIVE = wp.constant(0.3)  # share of the reaction time of a driver that is ready to brake, or creeps
 PREPARED = wp.constant(40.0)  # m before a junction from which a driver is ready to brake
-NOTICES = wp.constant(0.4)  # share of a change in what others demand that a driver takes up in a step
+NOTICES = wp.constant(0.4)  # share of a change in demand that a driver adopts in a step
 LOOKS_EVERY = wp.constant(3)  # steps after which a driver looks at crossing traffic again
-RELAXES = wp.constant(0.8)  # share of it, where a driver that looks finds that less is demanded
+RELAXES = wp.constant(0.8)  # share of the demand that remains when a driver sees that less is needed
 HARDEST = wp.constant(9.0)  # m/s^2
 CREEPS = wp.constant(4.0)  # m/s
 CRUISES = wp.constant(8.0)  # m/s from which the reaction time is the full one
-LAST_GAP = wp.constant(1.0)  # m that also a driver who is late keeps to where it stops
-LAUNCH = wp.constant(0.6)  # share by which the acceleration from rest is larger
-LAUNCHED = wp.constant(8.0)  # m/s from which on it is the ordinary one
-EARLY = wp.constant(1.4)  # times the comfortable deceleration at most, with which a driver begins to brake early
+LAST_GAP = wp.constant(1.0)  # m that a late driver keeps to its stopping place
+LAUNCH = wp.constant(0.6)  # share by which acceleration from rest is larger
+LAUNCHED = wp.constant(8.0)  # m/s from which acceleration is ordinary
+EARLY = wp.constant(1.4)  # times the comfortable deceleration, at most, when a driver begins to brake early
 LONGEST_WAIT = wp.constant(20.0)  # s
-PASS_GAP = wp.constant(1.0)  # m that a driver is before a conflict when the other one has left it
+PASS_GAP = wp.constant(1.0)  # m between a driver and a conflict when the other agent leaves it
 YIELD_GAP = wp.constant(2.0)  # m before a conflict at which a driver comes to rest
-YIELD_LEAST = wp.constant(0.4)  # m before it at which a driver stops who is late
-SLOWING = wp.constant(0.6)  # times the comfortable deceleration, with which a driver slows down for a bend
+YIELD_LEAST = wp.constant(0.4)  # m before a conflict at which a late driver stops
+SLOWING = wp.constant(0.6)  # times the comfortable deceleration, before a bend
 SAMPLES = wp.constant(8)  # points of the road ahead at which a driver looks for bends
-LOOKS = wp.constant(200.0)  # m
-DRIFT = wp.constant(20.0)  # s over which the judgement of gaps changes
+LOOKS = wp.constant(200.0)  # m ahead that a driver looks for bends
+DRIFT = wp.constant(20.0)  # s over which the misjudgement of gaps changes
 LAPSE = wp.constant(2.0)  # s of an error
 SWERVE = wp.constant(6.0)  # s over which the place in the lane changes
-WANDER = wp.constant(0.05)  # m of it
+WANDER = wp.constant(0.05)  # m by which that place varies
 
 
 @wp.func

@@ -1,7 +1,7 @@
-"""Drivers of the population give way: what they do about the agents that they would meet.
+"""Giving way of drivers of the population to the agents that they would meet.
 
-`traffic` lists the pairs. A kernel of their own works them off, which keeps its many registers and its long loops
-from the pairs that only follow.
+`traffic` lists the pairs. They have a kernel of their own, so that its many registers and long loops do not slow down
+the pairs that only follow.
 """
 
 import warp as wp
@@ -34,32 +34,32 @@ from ssad.world.kernels.traffic import has_priority, is_in_junction, looks_longe
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
-PASSES = wp.constant(1.0)  # m/s of somebody who is about to pass a driver that stands
-SOON_THERE = wp.constant(5.0)  # s until then
-LETS_BELOW = wp.constant(1.5)  # m/s of a driver that starts
-TOO_FAST = wp.constant(3.5)  # m/s with which a driver that has entered a stretch goes on
-WAITING = wp.constant(2.0)  # m/s of somebody who seems to wait
+PASSES = wp.constant(1.0)  # m/s of an agent that is about to pass a standing driver
+SOON_THERE = wp.constant(5.0)  # s until it passes
+LETS_BELOW = wp.constant(1.5)  # m/s of a starting driver that lets it pass
+TOO_FAST = wp.constant(3.5)  # m/s above which a driver that has entered a stretch goes on
+WAITING = wp.constant(2.0)  # m/s below which an agent seems to wait
 PARALLEL = wp.constant(0.9)  # cosine of two headings
-STOPS_THERE = wp.constant(0.5)  # m/s^2
-STARTS = wp.constant(0.3)  # m/s^2 of it
-RELIES = wp.constant(4.0)  # m/s^2 with which a driver relies on others to brake for it
-MARGIN = wp.constant(1.0)  # s between a driver that gives way and who comes after it
-UNSURE = wp.constant(0.06)  # s/m: the further away, the more of it
-LEAST_MARGIN = wp.constant(0.3)  # s of it, of who has priority
-AFTERWARDS = wp.constant(0.3)  # s between somebody who was let pass and the driver
-COVERED = wp.constant(0.05)  # s: sooner, the other one is in the way already
+STOPS_THERE = wp.constant(0.5)  # m/s^2 of braking by which an agent is expected to stop
+STARTS = wp.constant(0.3)  # m/s^2 from which a waiting agent starts
+RELIES = wp.constant(4.0)  # m/s^2 of braking that a driver relies on others to do for it
+MARGIN = wp.constant(1.0)  # s between a driver that gives way and the next agent
+UNSURE = wp.constant(0.06)  # s/m by which the margin grows with distance
+LEAST_MARGIN = wp.constant(0.3)  # s of margin of a driver that has priority
+AFTERWARDS = wp.constant(0.3)  # s between an agent that was let pass and the driver
+COVERED = wp.constant(0.05)  # s until the other agent arrives, below which it already covers the stretch
 STARTS_BELOW = wp.constant(0.3)  # m/s
 START_TIME = wp.constant(0.7)  # s that a start from rest takes longer: reaction, and jerk
-PICKS_UP_SHARE = wp.constant(0.8)  # of its acceleration, that a driver reckons with
-STILL_STOPS = wp.constant(6.0)  # m/s^2: who would have to brake harder is in the way of who passes
-JOINS = wp.constant(3.0)  # m from side by side, up to which who has priority goes first where two ways become one
-ENTERED = wp.constant(0.5)  # m before a stretch that somebody covers, from which a driver is in it
-TURNS = wp.constant(6.5)  # m/s: so slow, somebody who brakes is relied on to wait
+PICKS_UP_SHARE = wp.constant(0.8)  # share of its acceleration that a driver expects of itself
+STILL_STOPS = wp.constant(6.0)  # m/s^2 of needed braking up to which an agent that brakes is expected to stop
+JOINS = wp.constant(3.0)  # m beside each other, up to which the agent with priority goes first at a merge
+ENTERED = wp.constant(0.5)  # m before a covered stretch, from which a driver is in it
+TURNS = wp.constant(6.5)  # m/s below which a braking agent is expected to wait before its turn
 HOLDS = wp.constant(0.3)  # share of its acceleration, and m/s^2
-DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a driver that relies on somebody waits
-WARY = wp.constant(2.2)  # m/s^2 of it, up to which a driver does not care
+DOUBTS = wp.constant(0.5)  # share of its comfortable deceleration, with which a driver brakes until the other agent does
+WARY = wp.constant(2.2)  # m/s^2 that the other agent has to brake, below which a driver does not wait
 BRAKES = wp.constant(1.0)  # m/s^2
-AHEAD = wp.constant(8)  # m ahead whose speed limit counts for what a driver foresees of itself
+AHEAD = wp.constant(8)  # m ahead, whose speed limit bounds the speed that a driver expects of itself
 
 
 @wp.func

@@ -47,22 +47,22 @@ from ssad.world.kernels.traffic import line_ahead, stop_before
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
-THRESHOLD = wp.constant(0.2)  # m/s^2 of advantage below which nobody changes lane (MOBIL)
+THRESHOLD = wp.constant(0.2)  # m/s^2 of advantage below which a driver keeps its lane (MOBIL)
 BIAS = wp.constant(0.2)  # m/s^2 for which the lane of the route is preferred (MOBIL's bias to the right)
 SIGNALS = wp.constant(3.0)  # s that a driver indicates before it leaves its lane
-SIGNALS_LEAST = wp.constant(1.0)  # s of it where there is little room
-WAVERS = wp.constant(1.5)  # times its comfortable deceleration: a closing gap for which a driver gives a change up
+SIGNALS_LEAST = wp.constant(1.0)  # s of it if there is little room
+WAVERS = wp.constant(1.5)  # times its comfortable deceleration: a driver gives a change up if the gap demands more
 DECIDES = wp.constant(5)  # steps between two decisions
-SLOWER = wp.constant(0.8)  # m/s: who is hardly slower is not passed
-SLOWS = wp.constant(-0.7)  # m/s^2: who brakes for something ahead is not passed
-CLEARS = wp.constant(6.0)  # m ahead of whoever it has passed from which a driver returns
-NEARS = wp.constant(0.35)  # share of the difference of speeds that is lost meanwhile
-QUEUE_SPEED = wp.constant(3.0)  # m/s of whoever waits, or comes to it
-STARTS = wp.constant(3.0)  # m/s: slower, a change begins almost from rest
-PICKS_UP = wp.constant(1.0)  # m/s^2 of whoever starts behind
+SLOWER = wp.constant(0.8)  # m/s by which a leader has to be slower to be passed
+SLOWS = wp.constant(-0.7)  # m/s^2: a leader that brakes harder is not passed
+CLEARS = wp.constant(6.0)  # m ahead of the passed vehicle from which a driver returns
+NEARS = wp.constant(0.35)  # share of the speed difference that is lost until then
+QUEUE_SPEED = wp.constant(3.0)  # m/s of a vehicle that waits or joins a queue
+STARTS = wp.constant(3.0)  # m/s below which a change begins almost from rest
+PICKS_UP = wp.constant(1.0)  # m/s^2 of a starting follower
 LONG_WAIT = wp.constant(15.0)  # s
-LEAST_LENGTH = wp.constant(8.0)  # m of a change, of two-wheelers, too
-COMES_UP = wp.constant(8.0)  # s: nobody returns behind somebody slower whom it would soon come up with
+LEAST_LENGTH = wp.constant(8.0)  # m of a change, also for two-wheelers
+COMES_UP = wp.constant(8.0)  # s: a driver does not return behind a slower vehicle that it would reach sooner
 
 
 @wp.func

@@ -14,16 +14,16 @@ from ssad.world.kernels.shared import wrap
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
 ALIGNED = wp.constant(0.7)  # cosine of two headings that lead the same way
-SOON = wp.constant(0.5)  # s that a driver wants to come after another agent
-SLOWS = wp.constant(1.5)  # m/s^2 with which it slows down to its top speed
+SOON = wp.constant(0.5)  # s that a driver plans to arrive after another agent
+SLOWS = wp.constant(1.5)  # m/s^2 with which an agent slows down to its top speed
 MOST_GAIN = wp.constant(2.5)  # m/s^2
 AIR = wp.constant(0.9)  # m before another body
-BEHIND = wp.constant(20.0)  # m behind the driver up to which places are located
-PROJECTIONS = wp.constant(3)  # Newton steps with which a place is located along the way
-LONG = wp.constant(3.0)  # m, half of a body that needs more room in bends
+BEHIND = wp.constant(20.0)  # m behind the driver from which places are located
+PROJECTIONS = wp.constant(3)  # Newton steps that locate a place along the path
+LONG = wp.constant(3.0)  # m, half length from which a body needs more room in bends
 SWING = wp.constant(0.575)  # half of a wheelbase over half of a body
-MOST_SWING = wp.constant(2.0)  # m of it
-LOCATED = wp.constant(1.5)  # m that may be left of it
+MOST_SWING = wp.constant(2.0)  # m of swing at most
+LOCATED = wp.constant(1.5)  # m of error allowed in locating a place
 STEEPEST = wp.constant(0.3)  # least share of a metre along the other side of a bend
 
 

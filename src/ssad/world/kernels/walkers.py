@@ -1,12 +1,12 @@
 """Walkers of natural traffic: how they walk, wait and cross, and how vehicles yield to them.
 
-A walker follows its way along pavements and crossings. At the kerb it waits for the signals of the traffic that it
+A walker follows its route along pavements and crossings. At the kerb it waits for the signals of the traffic that it
 crosses, and for vehicles: at a crosswalk until each of them has yielded, can stop comfortably, or leaves a gap; without
 a crosswalk until the gap is long enough. The gap is the critical headway of the Highway Capacity Manual (2010, chapter
 19): the time to cross, and a margin. Groups wait for their leader and cross with it.
 
-An Autopilot stops before a crossing for whoever is on it and in its way, and before a crosswalk, or in a turn, also for
-whoever waits, as long as it can stop comfortably. Walkers on the pavement do not matter to it.
+An Autopilot stops before a crossing for walkers that are on it and in its path. Before a crosswalk and in a turn it
+also stops for waiting walkers, if it can do so comfortably. It does not react to walkers on the pavement.
 """
 
 import warp as wp
@@ -33,42 +33,42 @@ from ssad.world.kernels.traffic import stop_before
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
-NO_SIGNAL = wp.constant(0)  # answers of `crossing_signal`
+NO_SIGNAL = wp.constant(0)  # results of `crossing_signal`
 CLOSED = wp.constant(1)
 OPEN = wp.constant(2)
-GAPS = wp.constant(3)  # green for ever: nothing but a gap lets a walker cross
+GAPS = wp.constant(3)  # forced green: a walker can only cross in a gap
 SETS_OFF = wp.constant(0.7)  # s that a standing walker needs to start
 SPEEDS_UP = wp.constant(1.0)  # m/s^2 of a walker
 SLOWS = wp.constant(2.0)  # m/s^2 of a walker
 NEAR_KERB = wp.constant(2.5)  # s before the kerb from which a walker looks at the road
-ON_ROAD = wp.constant(0.15)  # m before the kerb beyond which nobody turns back
+ON_ROAD = wp.constant(0.15)  # m before the kerb beyond which walkers do not turn back
 SEES = wp.constant(150.0)  # m of a vehicle's route, and around a crossing
-POLITE = wp.constant(2.0)  # m/s^2: whoever can stop so gently is relied on to yield at a crosswalk
-NOTICE = wp.constant(0.7)  # s until a vehicle begins to brake, as walkers reckon
-FORCED = wp.constant(3.0)  # m/s^2: nobody steps in front of a vehicle that would have to brake harder
-EMERGENCY = wp.constant(4.5)  # m/s^2: a vehicle that would have to brake harder is let past by whoever crosses
+POLITE = wp.constant(2.0)  # m/s^2: a vehicle that can stop with less is relied on to yield at a crosswalk
+NOTICE = wp.constant(0.7)  # s that walkers expect a vehicle to take until it brakes
+FORCED = wp.constant(3.0)  # m/s^2: walkers do not make a vehicle brake harder
+EMERGENCY = wp.constant(4.5)  # m/s^2: crossing walkers let a vehicle pass that would have to brake harder
 YIELDING = wp.constant(0.7)  # m/s^2 of braking by which a walker sees that a vehicle yields
 GAINS = wp.constant(0.8)  # m/s^2 that a walker expects an approaching vehicle to gain
-SIDE = wp.constant(0.85)  # m from a vehicle's side to the middle of a walker that crosses beside it
-BESIDE = wp.constant(3.5)  # m that a vehicle which changes lanes may be beside its route
+SIDE = wp.constant(0.85)  # m from the side of a vehicle to the middle of a walker that crosses beside it
+BESIDE = wp.constant(3.5)  # m that a lane-changing vehicle may be beside its route
 STANDS = wp.constant(0.5)  # m/s
 IMPATIENCE = wp.constant(60.0)  # s of waiting after which the margin is a fourth
-HURRY = wp.constant(1.5)  # times its speed, at which a walker gets out of the way
+HURRY = wp.constant(1.5)  # times its speed, with which a walker gets out of the way
 PICKS_UP = wp.constant(1.5)  # m/s^2 that a driver expects of itself
-CLEARS = wp.constant(0.7)  # s between a walker and the vehicle that comes after it
-PASSES = wp.constant(1.5)  # s between a vehicle and the walker that comes after it
+CLEARS = wp.constant(0.7)  # s between a walker and the next vehicle
+PASSES = wp.constant(1.5)  # s between a vehicle and the next walker
 SLOW_ENOUGH = wp.constant(1.5)  # m/s
-FRONT = wp.constant(1.0)  # m of a crossing before a vehicle that stands on it, which are room enough to walk past
-TOUCHES = wp.constant(0.4)  # m from a vehicle's side to the middle of a walker before which it does not move
-COMFORT = wp.constant(2.0)  # m/s^2 with which a driver brakes for a walker who waits
-LINE = wp.constant(0.3)  # m less than its gap at rest, at which a driver stops before a crossing
+FRONT = wp.constant(1.0)  # m of a crossing in front of a standing vehicle that are enough to walk past
+TOUCHES = wp.constant(0.4)  # m from the side of a vehicle to a walker's middle, below which the vehicle does not move
+COMFORT = wp.constant(2.0)  # m/s^2 with which a driver brakes for a waiting walker
+LINE = wp.constant(0.3)  # m by which a driver stops nearer to a crossing than its gap at rest
 NOSE = wp.constant(0.8)  # m on a crossing up to which a vehicle still waits there
 SIDESTEP = wp.constant(0.4)  # m/s to the side
-SQUEEZES = wp.constant(0.3)  # m/s of a walker past another one where there is no room
+SQUEEZES = wp.constant(0.3)  # m/s of a walker that passes another one in a narrow place
 LEANS = wp.constant(0.35)  # rad from its way that a walker turns at most
 AIR = wp.constant(0.15)  # m between walkers that pass each other
 LOOKS_AHEAD = wp.constant(5.0)  # m within which a walker makes way
-STRAGGLES = wp.constant(2.5)  # m behind its place from which a walker no longer crosses with its group
+STRAGGLES = wp.constant(2.5)  # m behind its place, beyond which a walker no longer crosses with its group
 
 
 @wp.func

@@ -45,7 +45,7 @@ class Adversary(PolicyDriver):
 
 
 class AdvPPO:
-    """Adv.PPO: a learned policy drives the vehicle nearest to the ego and seeks proven collisions; one rollout a base."""
+    """Adv.PPO: a learned policy drives the vehicle nearest to the ego, for proven collisions; one rollout a base."""
 
     name = "adv-ppo"
 
