@@ -188,7 +188,7 @@ def between_lanes(graph: LaneGraph, place: Mapping[str, float]) -> bool:
 
 
 def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, device: str = "cpu") -> dict[str, Any]:
-    """Drive the episodes side by side for some seconds; vehicle-hours, and where who touched whom, left, or stood."""
+    """Drive episodes in parallel for some seconds; return vehicle-hours, contacts, vehicles off the road and queues."""
     world = World(episodes, {graph.name: graph}, device=device)
     shape = (world.batch, world.agents)
     before, stood = np.zeros(shape, np.int64), np.zeros(shape)

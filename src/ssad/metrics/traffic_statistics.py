@@ -250,7 +250,7 @@ def gap_choices(stays: Visits, entries: Ints, time_step: float, *, longest: floa
         stays: Stays inside the junctions.
         entries: [E, 3] vehicle, step in which it began to wait before a junction, step in which it entered.
         time_step: s.
-        longest: Gaps above it, s, are left out: nobody had to choose.
+        longest: Gaps above it, s, are left out: they need no decision.
     """
     accepted: list[float] = []
     rejected: list[float] = []

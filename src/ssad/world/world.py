@@ -229,7 +229,7 @@ class World:
         # Every agent may pair with every other agent, but only the ego pairs with believed objects.
         pair_capacity = self.batch * (self.agents * max(self.agents - 1, 1) + believed)
         self.work.pair = wp.zeros(pair_capacity, dtype=wp.int32, device=self.device)
-        # without drivers of the population, nobody foresees meetings
+        # only drivers of the population foresee meetings
         meeting_capacity = pair_capacity if self.bank.has_drivers else 1
         self.work.meeting = wp.zeros(meeting_capacity, dtype=wp.int32, device=self.device)
         self.work.crossing = wp.zeros(meeting_capacity, dtype=wp.float32, device=self.device)
