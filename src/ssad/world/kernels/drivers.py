@@ -82,7 +82,7 @@ def driver_follows(own_speed: float, leader_speed: float, gap: float, style: wp.
     wish = power * (1.0 - ratio * ratio)
     need = follow_need(own_speed, leader_speed, gap - 0.8 * style[1])
     if need > FIRM:
-        # who is late stops nearer to the leader
+        # a late driver stops nearer to the leader
         need = wp.max(FIRM, follow_need(own_speed, leader_speed, gap - LAST_GAP))
     return wp.max(wish, -wp.max(style[3], SMOOTH * need)) - power
 
@@ -99,7 +99,7 @@ def driver_stops(own_speed: float, distance: float, style: wp.vec4) -> float:
     power = driver_power(own_speed, style)
     allowed = power - (power + style[3]) * share * share
     if share > 1.0:
-        # who is late stops nearer to the place
+        # a late driver stops nearer to the place
         late = own_speed * own_speed / (2.0 * wp.max(distance - LAST_GAP, 0.3))
         allowed = -wp.max(style[3], late * wp.min(share, SMOOTH))
     if distance < style[1]:

@@ -172,7 +172,7 @@ def driver_gives_way(
                 return wp.min(follows, react)
             is_ahead = is_there or parallel or (lead < -JOINS and goes_first)
             if speed < LETS_BELOW and not goes_first and state.aim[b, i][0] < state.shift[b, i][1]:
-                is_ahead = bool(False)  # who begins to change lanes from rest is not ahead yet
+                is_ahead = bool(False)  # a vehicle that changes lanes from rest is not ahead yet
             if is_ahead or (not goes_first and meeting.near < ENTERED and speed > TOO_FAST):
                 return 0.0
         elif goes_first and lead > JOINS and is_in_junction(perceived, b, j):
@@ -242,7 +242,7 @@ def give_way(
         goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
         goes_first = change_priority(perceived, b, i, j, goes_first) or work.judgement[b, i][1] > 0.0
         if wp.max(state.speed[b, i], 0.0) < LETS_BELOW and other_speed > PASSES:
-            # who starts lets somebody pass who is about to
+            # a starting driver lets an agent pass that is about to
             if wp.length(wp.vec2(dx, dy)) < SOON_THERE * other_speed:
                 goes_first = False
         longitudinal = dx * wp.cos(pose[2]) + dy * wp.sin(pose[2])

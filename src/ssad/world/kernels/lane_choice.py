@@ -67,7 +67,7 @@ COMES_UP = wp.constant(8.0)  # s: a driver does not return behind a slower vehic
 
 @wp.func
 def gap_acceleration(speed: float, other_speed: float, gap: float, style: wp.vec4) -> float:
-    """Return the acceleration (m/s^2) behind somebody by the Intelligent Driver Model, however small the gap."""
+    """Return the acceleration (m/s^2) behind a leader by the Intelligent Driver Model, however small the gap."""
     closing = speed * (speed - other_speed) / (2.0 * wp.sqrt(style[2] * style[3]))
     ratio = (style[1] + wp.max(0.0, speed * style[0] + closing)) / wp.max(gap, 0.1)
     return wp.max(style[2] * (1.0 - ratio * ratio), -HARDEST)
@@ -75,7 +75,7 @@ def gap_acceleration(speed: float, other_speed: float, gap: float, style: wp.vec
 
 @wp.func
 def lane_acceleration(speed: float, target: float, other_speed: float, gap: float, style: wp.vec4) -> float:
-    """Return the acceleration on a lane, m/s^2: on a free road (gap FAR), or behind whoever is in front."""
+    """Return the acceleration on a lane, m/s^2: on a free road (gap FAR), or behind a leader."""
     free = driver_accelerates(speed, target, style)
     if gap >= FAR:
         return free
@@ -101,7 +101,7 @@ def accepts_gap(lane_gaps: vec7, speed: float, delay: float, braking: float, sty
 
 @wp.func
 def follower_loss(lane_gaps: vec7, speed: float, length: float, style: wp.vec4) -> float:
-    """Return what the agent behind on a lane loses if a vehicle of `length` m comes before it, m/s^2 (not positive)."""
+    """Return the loss of the follower on a lane if a vehicle of `length` m moves in ahead of it, m/s^2 (at most 0)."""
     loss = float(0.0)
     if lane_gaps[5] < FAR:
         without = float(0.0)
@@ -126,7 +126,7 @@ def has_queue_ahead(
     rows: wp.vec2i,
     reach: float,
 ) -> bool:
-    """Return whether somebody but the leader is slow or stands on i's lane within `reach` m: there is no way back."""
+    """Return whether another agent than the leader is slow or stands on i's lane within `reach` m: no way back."""
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
     pose = state.pose[b, i]
@@ -186,7 +186,7 @@ def return_to_route(
     if oncoming:
         delay = SIGNALS_LEAST
         change_length = wp.max(shortest, RAMP_TIME * speed)
-    # it is back in its lane before the other one ends, and before it stands behind whoever is in front
+    # it is back in its lane before the other lane ends, and before it stands behind a leader there
     front_speed = wp.max(lane_gaps[1], 0.0)
     front_room = lane_gaps[0] + 0.25 * front_speed * front_speed - 2.0
     length_room = wp.min(leads_on - 2.0, front_room)
@@ -196,7 +196,7 @@ def return_to_route(
     if must_return:
         merge_gaps = lane_gaps
         if speed < STARTS:
-            # until it has come in from rest, whoever is behind may have started, too; who has waited long risks more
+            # while it moves in from rest, the follower may start, too; a driver that has waited long risks more
             pick_up = float(PICKS_UP)
             if state.waited[b, i] > LONG_WAIT:
                 pick_up = 0.4 * PICKS_UP
@@ -243,7 +243,7 @@ def pass_leader(
     rows: wp.vec2i,
     decides: bool,
 ):
-    """Let a driver on its route begin to pass whoever it follows, where that is an advantage and safe."""
+    """Let a driver on its route begin to pass its leader, where that is an advantage and safe."""
     route = bank.route[e, i]
     shift = state.shift[b, i]
     u0 = state.aim[b, i][0]
@@ -291,7 +291,7 @@ def pass_leader(
             return
     shortest = wp.max(2.0 * RAMP_LEAST * own_body[0], LEAST_LENGTH)
     duration = courtesy[1]
-    # a driver that comes up with somebody loses some speed until it is past
+    # a driver that catches up with its leader loses some speed until it is past
     closing = wp.max(speed - wp.max(other_speed, 0.0), 0.0)
     change_length = wp.max(shortest, duration * (speed - NEARS * closing))
     # until it is back in its lane: a distance that grows by what the other goes until it is passed

@@ -223,7 +223,7 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
 @wp.func
 def waiting_line(roads: Roads, first: int, part: float, half: float, waited: float) -> float:
-    """Return `line_ahead` of an agent that reacts to others; -FAR for who is locked in a junction.
+    """Return `line_ahead` of an agent that reacts to others; -FAR for an agent that is locked in a junction.
 
     waited: s that it has stood.
     """
@@ -519,7 +519,7 @@ def scan_agents(
     rows: int,
     dt: float,
 ):
-    """An Autopilot's target speed, its reaction to signals, and whom it must look at more closely."""
+    """An Autopilot's target speed, its reaction to signals, and the agents that it must examine."""
     if state.active[b, i] != Presence.AWAKE:
         return
     e = state.episode[b]
@@ -557,7 +557,7 @@ def scan_agents(
     signal_now = int(SignalState.OFF)
     if signal_index >= 0 and road_rule[1] - offset < sight + 40.0:
         signal_now = light(bank, roads, state, perceived, b, i, e, signal_index, dt)
-    obeys = i > 0 or perceived.believes[b] == 0 or perceived.sign[b] == 1  # who does not know of a sign does not stop
+    obeys = i > 0 or perceived.believes[b] == 0 or perceived.sign[b] == 1  # unaware of a sign, the ego does not stop
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < sight + 20.0:
@@ -694,7 +694,7 @@ def waits_at_line(
     line: float,
     dt: float,
 ) -> bool:
-    """Return whether i waits for j before the junction and not in it, as all do but who turns left on green.
+    """Return whether i waits for j before the junction and not in it, as all do except those that turn left on green.
 
     line: metres from its front to where it would wait.
     """
@@ -729,7 +729,7 @@ def scan_all_agents(
     threads: int,
     dt: float,
 ):
-    """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
+    """For every Autopilot: its target speed, its reaction to signals, and the agents that it must examine.
 
     The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
     their order does not matter, since only the hardest reaction counts.
@@ -861,7 +861,7 @@ def react_to_agents(
                     and wp.min(state.waited[b, i], perceived.waited[b, j]) > JAMMED
                     and perceived.way[b, j][1] < other_half[0] + 0.5
                 ):
-                    state.stalled[b, i] = 1  # makes room for somebody who may have to back out of the junction
+                    state.stalled[b, i] = 1  # makes room for a vehicle that may have to back out of the junction
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
                 # a driver of the population does not brake hard for it
@@ -892,7 +892,7 @@ def react_to_agents(
                     goes_first = change_priority(perceived, b, i, j, goes_first)
                     if waits_at_line(bank, roads, state, perceived, b, i, j, e, goes_first, line, dt):
                         gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
-                    # whoever stands and has to wait is not expected to go after all
+                    # a standing agent that has to wait is not expected to go
                     if not goes_first or (gap < 0.5 * speed and wp.abs(perceived.speed[b, j]) > STANDS):
                         react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:

@@ -221,7 +221,7 @@ def lets_cross(
     if speed < STANDS:
         return yields == 1 or waited > 1.0
     if speed * speed > 2.0 * FORCED * wp.max(place[0] - 0.3, 0.0):
-        # too fast to stop for anybody, and past before the walker comes
+        # too fast to stop, and past before the walker arrives
         return place[1] / speed + PASSES + 0.5 < entry_time
     gap_time = arrival(place[0], speed, GAINS)
     if gap_time > exit_time + margin:
@@ -395,7 +395,7 @@ def make_way(
                 is_beside = gap < 0.0 and ahead > -half_along - own_half[0] - 0.1
                 is_slower = ahead > 0.0 and wish - other_speed > 0.1
                 if (is_beside or (is_slower and not in_group)) and not crosses:
-                    # on the right of whoever is not clearly on the right itself; on the other side if there is no room
+                    # right of a walker that is not clearly on the right; left of it if there is no room
                     left_of_it = beside < -0.05
                     if wp.abs(beside) < width:
                         if left_of_it and left + beside + reach_across > edges[1]:
@@ -411,7 +411,7 @@ def make_way(
                     if is_blocked and is_walker:
                         least = wp.min(wish, SQUEEZES)
                         if walk.status[b, other] == WalkStatus.WAITING or walk.status[b, other] == WalkStatus.READY:
-                            least = 0.0  # it stands at the kerb, and whoever wants to cross waits behind it
+                            least = 0.0  # it stands at the kerb, and others that cross wait behind it
                         if facing < -0.3:
                             if gap < 1.5:
                                 limit = wp.min(limit, wp.max(0.5 * wish, wp.min(wish, SQUEEZES)))
@@ -580,7 +580,7 @@ def walk_one(
         wrap(heading),
         new_speed,
     )
-    # for whoever shows or mirrors the walker; here it moves by its goal
+    # for displays and mirrors of the walker; here it moves by its goal
     top = bank.power[bank.model[e, j]][2]
     state.control[b, j] = wp.vec4(new_speed / wp.max(top, 0.1), 0.0, 0.0, 0.0)
 
@@ -637,7 +637,7 @@ def yield_one(
     if style[0] > 0.0:
         comfort = style[3]
     if state.accel[b, i] < -0.5:
-        comfort = 1.5 * comfort  # who brakes already goes on to do so
+        comfort = 1.5 * comfort  # a driver that brakes already goes on to do so
     half = body[1] + SIDE
     if is_changing_lane(state.shift[b, i]):
         half = half + BESIDE
@@ -672,11 +672,11 @@ def yield_one(
                     ):
                         stops = bool(False)
                         if walk.status[b, j] == WalkStatus.CROSSING:
-                            # who is on the crossing leaves it, unless somebody is about to walk past its front
+                            # a vehicle on the crossing leaves it, unless a walker is about to pass its front
                             stops = near > -NOSE or way - body[1] < TOUCHES
                             if not stops and speed < SLOW_ENOUGH:
                                 stops = rear - 2.0 * body[0] > FRONT
-                            # who is too late to stop goes on if it is past before the walker comes
+                            # a driver that cannot stop goes on if it is past before the walker arrives
                             if speed * speed > 2.0 * FORCED * wp.max(near, 0.1) and speed > SLOW_ENOUGH:
                                 if entry_time > rear / speed + 0.3:
                                     stops = bool(False)
