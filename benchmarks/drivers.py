@@ -138,11 +138,11 @@ def attack(
                 continue
             natural = natural or outcomes(trials, episodes, graphs, {})
             drivers = {FreaSelection(count=count): Adversary(name=adversary)} if adversary else {}
-            found = outcomes(trials, episodes, graphs, drivers) if adversary else natural
-            proven = proven_bases(bases, [[o] for o in found], trials, limit=1) if adversary else None
+            trial_outcomes = outcomes(trials, episodes, graphs, drivers) if adversary else natural
+            proven = proven_bases(bases, [[o] for o in trial_outcomes], trials, limit=1) if adversary else None
             for town in towns:
                 here = [k for k, e in enumerate(episodes) if town in (e.town, together)]
-                parts = ([rows[k] for k in here] for rows in (episodes, found, natural))
+                parts = ([rows[k] for k in here] for rows in (episodes, trial_outcomes, natural))
                 row = measured(*parts, None if proven is None else [proven[k] for k in here])
                 table.setdefault(town, {}).setdefault(ego, {})[label] = row
                 print(town, ego, label, *(f"{key} {text(value)}" for key, value in row.items()), flush=True)
@@ -157,7 +157,7 @@ def outcomes(trials: Trials, episodes: Sequence[Episode], graphs: Any, drivers: 
 
 def measured(
     episodes: Sequence[Episode],
-    found: Sequence[Outcome],
+    trial_outcomes: Sequence[Outcome],
     natural: Sequence[Outcome],
     proven: Sequence[bool] | None = None,
 ) -> dict[str, Any]:
@@ -167,16 +167,18 @@ def measured(
         return outcome.trace is not None and outcome.trace.end == "collision"
 
     values = {
-        "CR": [crashed(o) for o in found],
-        "valid": [o.is_valid for o in found],
-        "off": [o.off_road for o in found],
-        "others": [o.hit_others for o in found],
+        "CR": [crashed(o) for o in trial_outcomes],
+        "valid": [o.is_valid for o in trial_outcomes],
+        "off": [o.off_road for o in trial_outcomes],
+        "others": [o.hit_others for o in trial_outcomes],
     } | ({} if proven is None else {"proven": list(proven)})
     rows = {
         key: rate([case(e, v) for e, v in zip(episodes, column, strict=True)], "share")
         for key, column in values.items()
     }
-    pair = [{e.key: case(e, crashed(o)) for e, o in zip(episodes, side, strict=True)} for side in (found, natural)]
+    pair = [
+        {e.key: case(e, crashed(o)) for e, o in zip(episodes, side, strict=True)} for side in (trial_outcomes, natural)
+    ]
     return rows | {"more": plain(paired_difference(pair[0], pair[1], kind="share", min_clusters=MIN_ROUTES))}
 
 

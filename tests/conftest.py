@@ -135,7 +135,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
 
 @pytest.fixture(scope="session")
 def recorded(shared: Shared) -> Path:
-    """What `ssad record` writes: a second in Twinford (train) and one in Oldmarket (val)."""
+    """A data set of `ssad record`: a second in Twinford (train) and one in Oldmarket (val)."""
     from ssad.recorders.nuscenes import Recording, record_nuscenes
 
     def make(out: Path) -> None:

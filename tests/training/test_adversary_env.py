@@ -137,9 +137,9 @@ def test_conduct_is_that_of_a_proven_collision(places: list[tuple[float, float, 
         state = replace(world.state(), pose=world.state().pose.copy())
         state.pose[0, 1] = x, y, yaw
         alignment = SENSORS["road"](world, np.array([[0, 1]], np.int32))[:, 0]
-        found = conduct.record(state, np.array([[0, 1]], np.int32), alignment, np.array([heading], np.float32))
+        is_unflawed = conduct.record(state, np.array([[0, 1]], np.int32), alignment, np.array([heading], np.float32))
         heading = yaw
-    assert found.tolist() == [kept]
+    assert is_unflawed.tolist() == [kept]
 
 
 def test_the_region_is_asked_about_the_ego_before_and_after_each_step(monkeypatch) -> None:

@@ -152,12 +152,12 @@ def test_advantages_are_those_of_the_reward_where_the_ego_has_a_way_out() -> Non
     before = np.array([[-1.0, 0.5, -1.0, -1.0]], np.float32)
     after = np.array([[-1.0, -1.0, 0.5, -1.0]], np.float32)
     driven = np.array([[True, True, True, False]])
-    found = compose_advantages(reward, feasibility, before, after, driven)[0]
+    advantage = compose_advantages(reward, feasibility, before, after, driven)[0]
     mean, spread = reward[0, :3].mean(), reward[0, :3].std()
-    assert found[0] == pytest.approx((1.0 - mean) / spread, rel=1e-4)
+    assert advantage[0] == pytest.approx((1.0 - mean) / spread, rel=1e-4)
     mean, spread = feasibility[0, :3].mean(), feasibility[0, :3].std()
-    np.testing.assert_allclose(found[1:3], (feasibility[0, 1:3] - mean) / spread, rtol=1e-4)
-    assert found[3] == 0.0
+    np.testing.assert_allclose(advantage[1:3], (feasibility[0, 1:3] - mean) / spread, rtol=1e-4)
+    assert advantage[3] == 0.0
 
 
 def test_the_buffer_adds_up_what_steps_give_back() -> None:

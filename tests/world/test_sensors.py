@@ -208,14 +208,14 @@ def test_the_road_is_seen_with_its_direction_and_its_edges() -> None:
     lawful, wrong, beside, across = car(30.0), car(60.0, 3.5), car(90.0, -9.0), car(120.0, 0.0, np.pi / 2)
     reversing = car(150.0, speed=-2.0)
     world = World([episode(ego(), lawful, wrong, beside, across, reversing)], GRAPHS)
-    found = SENSORS["road"](world, agents(*((0, number) for number in range(1, 6))))
-    np.testing.assert_allclose(found[:, 0], [1.0, -1.0, -2.0, 0.0, -1.0], atol=1e-5)
-    ahead = found[:, 1:].reshape(5, 4, 5)  # agent, station, from 4 m on the left to 4 m on the right
+    readings = SENSORS["road"](world, agents(*((0, number) for number in range(1, 6))))
+    np.testing.assert_allclose(readings[:, 0], [1.0, -1.0, -2.0, 0.0, -1.0], atol=1e-5)
+    ahead = readings[:, 1:].reshape(5, 4, 5)  # agent, station, from 4 m on the left to 4 m on the right
     np.testing.assert_allclose(ahead[0], [[-1.0, -1.0, 1.0, -1.0, -1.0]] * 4, atol=1e-5)
     np.testing.assert_allclose(ahead[2], -1.0, atol=1e-5)
     np.testing.assert_allclose(ahead[3, 3], -1.0, atol=1e-5)  # 20 m north of a road that is 5.25 m wide
     together = SENSORS["adversary-on-road"](world, agents((0, 1)))[0]
-    np.testing.assert_array_equal(together[24:], found[0])
+    np.testing.assert_array_equal(together[24:], readings[0])
     np.testing.assert_allclose(together[:24:6], SENSORS["adversary"](world, agents((0, 1)))[0, ::6] / 10.0, atol=1e-6)
 
 
@@ -227,8 +227,8 @@ def test_lawful_adversaries_pay_for_the_road_and_for_the_direction_of_traffic() 
     alignment = SENSORS["road"](world, who)[:, 0]
     assert rewards.drives_against(world.state(), who, alignment).tolist() == [False, True, False]
     paper = rewards.adversary(world.state(), who, before)
-    found = rewards.lawful(world.state(), who, before, alignment, off_road=0.5, against=2.0)
-    np.testing.assert_allclose(paper - found, [0.0, 2.0, 0.5], atol=1e-6)
+    reward = rewards.lawful(world.state(), who, before, alignment, off_road=0.5, against=2.0)
+    np.testing.assert_allclose(paper - reward, [0.0, 2.0, 0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize("proven", [True, False])
@@ -239,6 +239,6 @@ def test_a_contact_with_the_ego_is_paid_by_what_it_proves(proven: bool) -> None:
     world.step(np.zeros((1, 4, 3), np.float32))
     alignment = SENSORS["road"](world, who)[:, 0]
     judged = np.array([proven, False])
-    found = rewards.proving(world.state(), who, before, alignment, judged)
+    reward = rewards.proving(world.state(), who, before, alignment, judged)
     progress = 0.3 * np.clip(before - rewards.distance_to_goal(world.state(), who), -1.0, 1.0)
-    np.testing.assert_allclose(found - progress, [30.0 if proven else -3.0, -15.0], atol=1e-6)
+    np.testing.assert_allclose(reward - progress, [30.0 if proven else -3.0, -15.0], atol=1e-6)

@@ -83,8 +83,8 @@ class Conduct:
             | hit_others(state, agents)
         )
         self._was_on_road[scene] |= on_road
-        kept: Bool = ~self._is_flawed[scene] & ~is_against
-        return kept
+        is_unflawed: Bool = ~self._is_flawed[scene] & ~is_against
+        return is_unflawed
 
 
 class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed

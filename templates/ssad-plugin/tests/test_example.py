@@ -46,7 +46,7 @@ def test_the_adversary_proves_that_the_driver_follows_too_closely(tmp_path: Path
     """A driver that looks 4 m ahead, from its middle, sees nobody in time; one with a safe gap would have stopped."""
     import ssad
 
-    found = ssad.run(
+    results = ssad.run(
         "adversarial-quick",
         set={
             "systems": ["example-careful?reach=4@short", "autopilot"],
@@ -57,8 +57,8 @@ def test_the_adversary_proves_that_the_driver_follows_too_closely(tmp_path: Path
         workers=0,
         quiet=True,
     )
-    assert not found.failures
-    proven = {row["system"]: row["metrics"]["proven"] for row in found.rows}
+    assert not results.failures
+    proven = {row["system"]: row["metrics"]["proven"] for row in results.rows}
     assert proven == {"short": True, "autopilot": False}
 
 
@@ -67,9 +67,9 @@ def test_the_kind_runs(tmp_path: Path) -> None:
 
     suite = tmp_path / "coin.yaml"
     suite.write_text("kind: example-coin\nname: coin\nsystems: [penny, dime]\ntosses: 100\n")
-    found = ssad.run(suite, out=tmp_path / "run", workers=0, quiet=True)
-    assert [0.2 < row["metrics"]["heads"] < 0.8 for row in found.rows] == [True, True]
-    assert found.report.is_file()
+    results = ssad.run(suite, out=tmp_path / "run", workers=0, quiet=True)
+    assert [0.2 < row["metrics"]["heads"] < 0.8 for row in results.rows] == [True, True]
+    assert results.report.is_file()
 
 
 def test_the_detector_keeps_its_promises_and_the_attack_its_budget() -> None:

@@ -21,7 +21,7 @@ DRIVERS, PERIODS = 20, 400
 
 @pytest.fixture(scope="module")
 def errors() -> np.ndarray:
-    """Whether each driver errs in each period [DRIVERS, PERIODS]."""
+    """Errors of each driver in each period, bool [DRIVERS, PERIODS]."""
     middle = [(period + 0.5) * PERIOD for period in range(PERIODS)]
     habits = [wp.vec3(0.0, RATE, float(1000 * number + 7)) for number in range(DRIVERS)]
     return np.array([[is_lapsed(habit, time) for time in middle] for habit in habits])

@@ -1,4 +1,4 @@
-"""How a driver of the population foresees that paths cross, and what it does about it: closed forms."""
+"""Crossing paths that a driver of the population foresees, and its reactions to them, in closed form."""
 
 from __future__ import annotations
 

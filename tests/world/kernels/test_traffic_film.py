@@ -72,9 +72,9 @@ def changed(name: str, steps: slice, value: float) -> dict[str, object]:
     ],
 )
 def test_what_is_worth_a_look_is_told_with_its_time(changes: dict[str, object], texts: list[tuple[float, str]]) -> None:
-    told = remarks(load_town("Twinford"), still_drive(**changes))
-    assert [time for time, _ in told] == pytest.approx([time for time, _ in texts])
-    for (_, line), (_, text) in zip(told, texts, strict=True):
+    remark_lines = remarks(load_town("Twinford"), still_drive(**changes))
+    assert [time for time, _ in remark_lines] == pytest.approx([time for time, _ in texts])
+    for (_, line), (_, text) in zip(remark_lines, texts, strict=True):
         assert line.startswith("0 (car 0) at (122, 45): ")
         assert text in line
 
@@ -84,11 +84,11 @@ def test_bodies_that_nearly_touch_are_told_once() -> None:
     pose, speed = drive.pose.copy(), drive.speed.copy()
     pose[200:250, 1, :2] = (122.0 + 0.95 + 0.25 + 0.1, 45.0)  # 0.1 m beside the car
     speed[200:250, 1] = 1.0
-    told = remarks(load_town("Twinford"), replace(drive, pose=pose, speed=speed))
-    assert [line for time, line in told if time == pytest.approx(20.1)] == [
+    remark_lines = remarks(load_town("Twinford"), replace(drive, pose=pose, speed=speed))
+    assert [line for time, line in remark_lines if time == pytest.approx(20.1)] == [
         "0 (car 0) at (122, 45): 0.10 m from 1 (walker 1), 0.0 and 1.0 m/s"
     ]
-    assert len(told) == 1
+    assert len(remark_lines) == 1
 
 
 def test_the_summary_counts_stops_creeping_and_sideways_acceleration() -> None:
@@ -114,10 +114,10 @@ def test_a_start_on_red_is_told_unless_it_turns_to_the_near_side(turn: int, stat
     pose[:, 0] = np.stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), np.full(STEPS, yaw)], axis=1)
     signals = np.full_like(drive.signal, SignalState[state])
     signals[:100, signal] = SignalState.GREEN
-    told = remarks(graph, replace(drive, pose=pose, signal=signals, turn=np.full_like(drive.turn, turn)))
+    remark_lines = remarks(graph, replace(drive, pose=pose, signal=signals, turn=np.full_like(drive.turn, turn)))
     expected = [(22.6, "passes its stop line 12.6 s after red began")] * is_told
-    assert [time for time, _ in told] == pytest.approx([time for time, _ in expected])
-    assert all(text in line for (_, line), (_, text) in zip(told, expected, strict=True))
+    assert [time for time, _ in remark_lines] == pytest.approx([time for time, _ in expected])
+    assert all(text in line for (_, line), (_, text) in zip(remark_lines, expected, strict=True))
 
 
 def colours(image: np.ndarray) -> set[tuple[int, ...]]:
@@ -146,10 +146,8 @@ def test_pictures_show_bodies_lights_and_signals() -> None:
 def test_a_scene_is_driven_once_and_read_again(tmp_path: Path) -> None:
     """All kinds of agents are in it, and the busiest junction is one that vehicles visit."""
     graph = load_town("Twinford")
-    given = Namespace(
-        minutes=1 / 60, drivers="population", vehicles=3, walkers=2, cyclists=1, seed=5000, anew=False, device="cpu",
-        out=tmp_path,
-    )  # fmt: skip
+    agents = {"drivers": "population", "vehicles": 3, "walkers": 2, "cyclists": 1}
+    given = Namespace(minutes=1 / 60, seed=5000, anew=False, device="cpu", out=tmp_path, **agents)
     drive, is_new = recorded(graph, given)
     assert is_new
     assert drive.speed.shape == (10, 6)

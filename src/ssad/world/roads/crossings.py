@@ -93,10 +93,10 @@ def _traffic(graph: LaneGraph, crossing: Crossing) -> list[SignalledTraffic]:
 def _signals_before(graph: LaneGraph, lane: int, place: float) -> dict[int, float]:
     """Return the signals that release straight traffic to a place on a lane, and its travel time from green, s."""
     real = ~graph.signal_virtual[graph.stop_signal]
-    own = np.flatnonzero((graph.stop_lane == lane) & real & (graph.stop_s <= place + 2.0))
-    own = own[place - graph.stop_s[own] < NEAR_LINE]
-    if len(own):
-        return {int(graph.stop_signal[row]): LOST_TIME for row in own}
+    stop_rows = np.flatnonzero((graph.stop_lane == lane) & real & (graph.stop_s <= place + 2.0))
+    stop_rows = stop_rows[place - graph.stop_s[stop_rows] < NEAR_LINE]
+    if len(stop_rows):
+        return {int(graph.stop_signal[row]): LOST_TIME for row in stop_rows}
     signals: dict[int, float] = {}
     connections = [lane] if graph.junction[lane] >= 0 else graph.predecessors(lane).tolist()
     for connection in connections:

@@ -96,7 +96,7 @@ OBJECTIVES: dict[str, Callable[[Outcome], float]] = {
     "proof": lambda outcome: outcome.proof_value,
     "danger": lambda outcome: outcome.danger,
 }
-"""What a search can maximise: see `Outcome`. `danger` counts a collision with an ego that stands as any other."""
+"""Objectives that a search can maximise: see `Outcome`. `danger` also counts collisions with a standing ego."""
 
 
 class BoxSearch(ABC):
