@@ -133,13 +133,18 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def list_files(folder: Path) -> list[Path]:
+    """Return the files below a folder, without the byte code of the modules that earlier commands imported from it."""
+    return [path for path in sorted(folder.rglob("*.*")) if "__pycache__" not in path.parts]
+
+
 @pytest.mark.parametrize(("words", "told"), CASES, ids=[words for words, _ in CASES])
 def test_a_mistake_ends_in_one_line(words: str, told: str, wrong: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(wrong)
-    before = sorted(wrong.rglob("*.*"))
+    before = list_files(wrong)
     done = ssad(*shlex.split(words))
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
     assert told in done.stderr
-    assert [path for path in sorted(wrong.rglob("*.*")) if "__pycache__" not in str(path)] == before
+    assert list_files(wrong) == before
