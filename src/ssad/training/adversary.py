@@ -48,8 +48,8 @@ _LONG: dict[str, Any] = {
     "noise": 0.4,
     "entropy": 0.002,
     "rollout": 64,
-    "steps": 2_000_000,
-    "validate": 250_000,
+    "steps": 400_000,
+    "validate": 50_000,
 }
 ADVERSARIES = {
     "adv-ppo": replace(POLICY_RECIPES["ppo"], **_PROVING, **_LONG),
