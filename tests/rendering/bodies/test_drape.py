@@ -55,13 +55,15 @@ def test_what_lies_beside_or_behind_the_surface_is_left_out() -> None:
     near = box((0.1, 1.0, 1.0), material=GREY, centre=(1.0, 0.0, 0.5))
     far = box((0.1, 3.0, 1.0), material=GREY)
     surface = Surface(merge([near, far]), "front")
-    (piece,) = patches(surface, [(rectangle((-1.0, 0.2), (5.0, 0.4)), RED, LIFT)])
-    # The far box ends at y = 1.5; before it, between -0.5 and 0.5, stands the near one.
-    assert area_in_view(piece, 0) == pytest.approx(2.5 * 0.2, rel=1e-6)
-    depths = piece.corners().mean(axis=1)
-    in_front = np.abs(depths[:, 1]) < 0.5
-    np.testing.assert_allclose(depths[in_front, 0], 1.05 + LIFT, atol=1e-6)
-    np.testing.assert_allclose(depths[~in_front, 0], 0.05 + LIFT, atol=1e-6)
+    (piece,) = patches(
+        surface, [([*rectangle((-0.4, 0.2), (0.4, 0.4)), *rectangle((0.6, 0.2), (5.0, 0.4))], RED, LIFT)]
+    )
+    # The far box ends at y = 1.5; before its middle stands the near one.
+    assert area_in_view(piece, 0) == pytest.approx((0.8 + 0.9) * 0.2, rel=1e-6)
+    middles = piece.corners().mean(axis=1)
+    in_front = np.abs(middles[:, 1]) < 0.5
+    np.testing.assert_allclose(middles[in_front, 0], 1.05 + LIFT, atol=1e-6)
+    np.testing.assert_allclose(middles[~in_front, 0], 0.05 + LIFT, atol=1e-6)
     assert patches(surface, [(rectangle((4.0, 0.2), (5.0, 0.4)), RED, LIFT)]) == []
     assert patches(surface, []) == []
 

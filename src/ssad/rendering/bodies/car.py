@@ -223,6 +223,8 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int,
     variation = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
     chrome, roof_rails = (float(share) for share in generator.random(2))
     spokes = int(generator.integers(5, 8))
+    if is_target:  # one of them is like the other
+        variation, chrome, roof_rails, spokes = np.zeros(4), 0.5, 0.0, 5
     shell = replace(
         style_shell,
         radius=style_shell.radius * (1.0 + 0.02 * variation[0]),

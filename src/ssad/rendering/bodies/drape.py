@@ -86,6 +86,8 @@ class Surface:
         low, high = polygons.min(axis=1), polygons.max(axis=1)
         overlaps = (self.cells.min(axis=1) < high[:, None]) & (self.cells.max(axis=1) > low[:, None])
         polygon_index, face_index = np.nonzero(overlaps.all(axis=-1))
+        if not len(face_index):
+            return None
         points, counts = _clip(polygons[polygon_index], counts[polygon_index], self.cells[face_index])
         is_area = _areas(points, counts) > MIN_PIECE
         points, counts, owner, face_index = (
@@ -93,7 +95,7 @@ class Surface:
         )
         shares = _barycentric(points, flat[face_index])
         positions = np.einsum("nkc,ncd->nkd", shares, self.corners[face_index])
-        # Of faces behind one another only the nearest is covered.
+        # Of faces behind one another only the one that is nearest at the middle of the piece is covered.
         middle = points.mean(axis=1)
         middle_shares = _barycentric(np.broadcast_to(middle, (len(flat), len(middle), 2)), flat)
         depths = sign * np.einsum("fnc,fc->fn", middle_shares, self.corners[:, :, axis])
