@@ -296,7 +296,9 @@ def _motorbike(segments: int, detail: int, *, fairing: bool) -> tuple[list[Mesh]
     fork_crown = np.array([0.40, 0.0, 0.95])
     side_offset = np.array([0.0, 0.09, 0.0])
     parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, segments))
-    parts.append(tube([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)], 0.04, material=FRAME, segments=segments))
+    parts.append(
+        tube(np.array([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)]), 0.04, material=FRAME, segments=segments)
+    )
     if detail:
         parts.append(
             tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, segments)

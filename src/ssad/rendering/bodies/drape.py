@@ -90,9 +90,8 @@ class Surface:
             return None
         points, counts = _clip(polygons[polygon_index], counts[polygon_index], self.cells[face_index])
         is_area = _areas(points, counts) > MIN_PIECE
-        points, counts, owner, face_index = (
-            array[is_area] for array in (points, counts, owner[polygon_index], face_index)
-        )
+        points, counts = points[is_area], counts[is_area]
+        owner, face_index = owner[polygon_index][is_area], face_index[is_area]
         shares = _barycentric(points, flat[face_index])
         positions = np.einsum("nkc,ncd->nkd", shares, self.corners[face_index])
         # Of faces behind one another only the one that is nearest at the middle of the piece is covered.
@@ -105,9 +104,8 @@ class Surface:
         is_nearest = sign * positions[..., axis].mean(axis=1) > nearest - BEHIND
         if not is_nearest.any():
             return None
-        positions, counts, shares, owner, face_index = (
-            array[is_nearest] for array in (positions, counts, shares, owner, face_index)
-        )
+        positions, counts, shares = positions[is_nearest], counts[is_nearest], shares[is_nearest]
+        owner, face_index = owner[is_nearest], face_index[is_nearest]
         normals = np.einsum("nkc,ncd->nkd", shares, self.normals[face_index])
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         lifts = np.array([lift for _, _, lift in pieces])

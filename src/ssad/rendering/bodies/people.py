@@ -422,7 +422,11 @@ def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segme
     if appearance.bands is not None:
         places, *profile = np.array(shirt_rows).T
         edges = [edge for row in BAND_ROWS for edge in (row, row + BAND_WIDTH)]
-        band_rows = [(edge, *(float(np.interp(edge, places, values)) for values in profile)) for edge in edges]
+        half_depths, half_widths = profile
+        band_rows = [
+            (edge, float(np.interp(edge, places, half_depths)), float(np.interp(edge, places, half_widths)))
+            for edge in edges
+        ]
         shirt_rows = sorted({round(row[0], 6): row for row in (*shirt_rows, *band_rows)}.values())
     depth_share = 1.12 if child else 1.0
     angles = np.arange(segments) * (2.0 * np.pi / segments)
@@ -565,13 +569,17 @@ def _facial_features(appearance: PersonAppearance, detail: int) -> Mesh:
     ]
     faces += [(first, first + 1, first + 3), (first, first + 2, first + 1), (first + 1, first + 2, first + 3)]
     material += [4, 4, 4]
-    lips = replace(
-        LIPS,
-        colour=tuple(0.6 * tint + 0.4 * skin for tint, skin in zip(LIPS.colour, appearance.skin.colour, strict=True)),
-    )
-    brows = replace(appearance.hair, name="brows", colour=tuple(0.7 * tint for tint in appearance.hair.colour))
+    lips = replace(LIPS, colour=_mixed(LIPS.colour, appearance.skin.colour, 0.4))
+    brows = replace(appearance.hair, name="brows", colour=_mixed(appearance.hair.colour, (0.0, 0.0, 0.0), 0.3))
     materials = (EYES, lips, WHITES, brows, appearance.skin)
     return build(points, faces, materials=materials, material=material, smooth=0.9)
+
+
+def _mixed(
+    first: tuple[float, float, float], second: tuple[float, float, float], share: float
+) -> tuple[float, float, float]:
+    """Return a colour between two: the share of the second."""
+    return as_point((1.0 - share) * np.array(first) + share * np.array(second))
 
 
 def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, size_share: float) -> list[Mesh]:
