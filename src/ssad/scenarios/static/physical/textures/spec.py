@@ -37,6 +37,7 @@ class TextureSpec:
         file: Existing texture (see `load_texture`); None: it is trained.
         inks: Whether controls have the nearest colours that inks can give, and trainings tones of inks; of a file,
             whether it is projected onto the gamut of the inks.
+        approach: Whether it is trained on views at all distances of an approach.
     """
 
     attack: str
@@ -50,6 +51,7 @@ class TextureSpec:
     around: int = 0
     file: str | None = None
     inks: bool = False
+    approach: bool = False
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Self:
@@ -82,7 +84,8 @@ class TextureSpec:
         data_key = attack, self.source, self.carrier, safeio.dump_json(self.options)
         training_key = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
         # Added only if used, so that the names of textures without it stay the same.
-        optional_key = (*((self.around,) if self.around else ()), *(("inks",) if self.inks else ()))
+        flags = tuple(name for name in ("inks", "approach") if getattr(self, name))
+        optional_key = (*((self.around,) if self.around else ()), *flags)
         return f"{attack}-{digest('texture', *data_key, *training_key, *optional_key)[:12]}"
 
     @property
