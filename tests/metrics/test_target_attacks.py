@@ -8,7 +8,7 @@ import torch
 
 from ssad.core.detections import Detections, Truth
 from ssad.metrics.intervals import replicate_limits
-from ssad.metrics.target_attacks import TargetSighting, precision_replicates, precision, sighting, target_scores
+from ssad.metrics.target_attacks import TargetSighting, precision, precision_replicates, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 

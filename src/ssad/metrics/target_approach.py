@@ -101,8 +101,8 @@ def approach_scores(
             `confidence` (mean score) and `found` (share above 0.25); with five drives or more also `intervals` and
             `replicates` of the first two;
         axis: the distances at which attacks are scored (see `axis_of`);
-        first_detected: on this axis, m (see `first_detection`), with its 95 % `interval` (percentiles over drives) where
-            there are enough; `is_end`: it is the end of the axis, so the target may be detected from farther.
+        first_detected: on this axis, m (see `first_detection`), with its 95 % `interval` (percentiles over drives)
+            where there are enough; `is_end`: it is the end of the axis, so the target may be detected from farther.
     """
     sightings = clean_sightings if attacked_sightings is None else attacked_sightings
     distance_of_image = np.array([float(row["distance"]) for row in rows])
@@ -110,7 +110,7 @@ def approach_scores(
     drives = sorted({entry.drive for entry in sightings})
     drive_of_image: I32 = np.array([drives.index(entry.drive) for entry in sightings], np.int32)
     confidences = np.array([float(entry.confidences()[0]) for entry in sightings])
-    groups = [np.flatnonzero(distance_of_image == distance) for distance in distances]
+    groups = [np.flatnonzero(distance_of_image == distance).tolist() for distance in distances]
     axis = axis_of(distances, [precision([clean_sightings[index] for index in group]) for group in groups])
     cells = [
         _cell(distance, [sightings[index] for index in group], confidences[group], replicates=replicates, seed=seed)

@@ -124,7 +124,7 @@ class Physical(OpenLoopKind):
         suite.recordings(Path(), "cpu")
 
     def order(self, cell: Cell) -> float:
-        """From behind, then on the way to it, then from all around; clean first, then controls, then what is trained."""
+        """From behind, on the way to it, from all around; in each clean first, then controls, then what is trained."""
         stage = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
         return stage + 3 * VIEWS.index(cell.fields["view"])
 

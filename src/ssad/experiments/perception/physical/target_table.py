@@ -249,7 +249,7 @@ class TargetTable(Schema):
             for town, count in images.items()
         ]
         if self.approach is not None:
-            distances = tuple(self.approach.distances)
+            distances = {"approach" if mode == "drive" else "distances": tuple(self.approach.distances)}
             recordings_by_name += [
                 make_recording(
                     folder / "data" / f"{town}-{APPROACH}",
@@ -257,7 +257,7 @@ class TargetTable(Schema):
                     mode=mode,
                     size=self.approach.size,
                     behind=self.behind,
-                    **{"approach" if mode == "drive" else "distances": distances},
+                    **distances,  # type: ignore[arg-type]
                 )
                 for town, count in approach_images.items()
             ]

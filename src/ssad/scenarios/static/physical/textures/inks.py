@@ -120,7 +120,8 @@ def gamut_distance(colour: Tensor) -> Tensor:
         colour: sRGB [3, H, W] in 0 to 1.
     """
     nearest = ink_albedo(tones_of(colour.double()))
-    return (_lab(_albedo(colour.double())) - _lab(nearest)).norm(dim=0)
+    distances: Tensor = torch.linalg.vector_norm(_lab(_albedo(colour.double())) - _lab(nearest), dim=0)
+    return distances
 
 
 def share_outside(colour: Tensor, mask: Tensor | None = None) -> float:
