@@ -393,14 +393,11 @@ def _bracketed(
         if control_carrier == carrier and learns_nothing(control, name)
         for line in lines
     ]
-    unproven = {
-        position
-        for position, value in heat_map.values.items()
-        for control_map in control_maps
-        if value is not None
-        and (control_value := control_map.values.get(position)) is not None
-        and control_value <= value
-    }
+    unproven = set()
+    for position, value in heat_map.values.items():
+        controls = [control_map.values.get(position) for control_map in control_maps]
+        if value is not None and any(control is not None and control <= value for control in controls):
+            unproven.add(position)
     return replace(heat_map, bracketed=frozenset(unproven))
 
 
