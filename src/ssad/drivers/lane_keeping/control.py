@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 
 from ssad.core.driving import Belief, Observation
+from ssad.core.perception import PerceivedLane
 from ssad.core.types import F64, AgentKind, SignalState
-from ssad.drivers.lane_keeping.lane import Lane
 
 PREVIEW: Final = (4.0, 0.45)  # m, s: the pursued point lies so far ahead, plus the way of so much time
 LATERAL: Final = 2.5  # m/s^2, lateral acceleration in bends
@@ -22,7 +22,7 @@ PATH: Final = 0.3  # m between the body of the ego and what does not lie in its 
 REACH: Final = 80.0  # m ahead
 
 
-def pursuit_curvature(lane: Lane, speed: float) -> float:
+def pursuit_curvature(lane: PerceivedLane, speed: float) -> float:
     """Return the curvature of the circle through a point of the lane's middle ahead, 1/m, positive to the left.
 
     Pure pursuit (Coulter, CMU-RI-TR-92-01, 1992). On a circular lane it is the curvature of the lane.
@@ -46,12 +46,12 @@ def steer_for(curvature: float, wheelbase: float, lock: float) -> float:
     return float(np.clip(wheel_angle / lock, -1.0, 1.0))
 
 
-def bend_speed(lane: Lane) -> float:
+def bend_speed(lane: PerceivedLane) -> float:
     """Return the speed at which the bend of a lane takes `LATERAL`, m/s."""
     return float(np.sqrt(LATERAL / max(abs(lane.curvature), 1e-4)))
 
 
-def following_acceleration(view: Observation, belief: Belief, row: int, lane: Lane, size: F64) -> float:
+def following_acceleration(view: Observation, belief: Belief, row: int, lane: PerceivedLane, size: F64) -> float:
     """Return the acceleration that keeps the distance to the nearest believed object in the lane, m/s^2.
 
     That of the Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000), without its term for the free road.

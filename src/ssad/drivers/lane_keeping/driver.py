@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +19,7 @@ import numpy as np
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.perception import PerceivedLane
 from ssad.core.types import F32, F64, U8, Controller, Episode
 from ssad.drivers.lane_keeping.control import (
     COMFORT,
@@ -32,9 +32,9 @@ from ssad.drivers.lane_keeping.control import (
     pursuit_curvature,
     steer_for,
 )
-from ssad.drivers.lane_keeping.lane import Lane, LaneFilter
+from ssad.drivers.lane_keeping.lane import LaneFilter
 from ssad.drivers.lane_keeping.markings import RoadMap, TopView, marking_strength
-from ssad.drivers.perceiving.driver import PerceivingDriver
+from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
 from ssad.drivers.perceiving.parts import Perceiver
 from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_cameras
 from ssad.world.models import agent_model
@@ -42,23 +42,6 @@ from ssad.world.models import agent_model
 CHANNEL: Final = "CAM_FRONT"
 SURE: Final = 0.5  # confidence from which on markings count as detected
 PATIENCE: Final = 1.5  # s without markings before it slows down
-
-
-@dataclass(frozen=True, eq=False)
-class LaneEvent:
-    """Lane that a driver believes in at a step, for observers.
-
-    Attributes:
-        scene: Index of the scene.
-        time: s.
-        lane: The lane; None: none was found yet.
-        image: Image that it was detected in, uint8 [3, H, W]; None: a loss of signal.
-    """
-
-    scene: int
-    time: float
-    lane: Lane | None
-    image: Any = None
 
 
 class _Scene:
@@ -70,7 +53,7 @@ class _Scene:
         self.pose: F64 | None = None
         self.time = 0.0
         self.lost_since: float | None = None
-        self.lane: Lane | None = None
+        self.lane: PerceivedLane | None = None
 
 
 class LaneKeeper(PerceivingDriver):
@@ -151,7 +134,7 @@ class LaneKeeper(PerceivingDriver):
             controls[row] = np.clip([throttle, brake, steer], [0.0, 0.0, -1.0], 1.0)
         return controls
 
-    def _lane(self, scene: _Scene, view: Observation, row: int, image: Any) -> Lane | None:
+    def _lane(self, scene: _Scene, view: Observation, row: int, image: Any) -> PerceivedLane | None:
         """Return the lane at the present time, from the image if it is not lost."""
         pose, time = view.pose[row].astype(np.float64), float(view.time[row])
         if scene.pose is not None:
@@ -167,10 +150,10 @@ class LaneKeeper(PerceivingDriver):
         is_lost = lane is None or lane.confidence < SURE
         scene.lost_since = None if not is_lost else scene.lost_since if scene.lost_since is not None else time
         if self.watch is not None:
-            self.watch(LaneEvent(int(view.scene[row]), time, lane, pixels))  # type: ignore[arg-type]
+            self.watch(LaneEvent(int(view.scene[row]), time, lane, pixels))
         return lane
 
-    def _cruise(self, scene: _Scene, view: Observation, row: int, lane: Lane | None) -> tuple[float, float]:
+    def _cruise(self, scene: _Scene, view: Observation, row: int, lane: PerceivedLane | None) -> tuple[float, float]:
         """Return the acceleration on a free road, m/s^2, and the steering."""
         speed = float(view.speed[row])
         if lane is None:

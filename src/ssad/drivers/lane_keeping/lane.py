@@ -8,17 +8,18 @@ Trans. ITS 7, 2006).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from ssad.core.perception import PerceivedLane
 from ssad.core.types import F32, F64
 from ssad.drivers.lane_keeping.markings import TopView
 
 # reach, m, and half width, m, around the predicted line, of the fits one after the other: each extends the one before
 FITS: Final = ((14.0, 0.7), (20.0, 0.6), (28.0, 0.5), (np.inf, 0.4))
 NOISE: Final = 0.35  # m, standard deviation of the place of a marking in one row; neighbouring rows err together
+NOISE_STEP: Final = 0.25  # m from one of these rows to the next
 FULL_WEIGHT: Final = 12.0  # m up to which rows count fully; further ones as they shrink in the image
 CHANGE: Final = (0.05, 0.02, 0.004, 0.02)  # standard deviation of the change of each number in a step of 0.1 s
 INITIAL: Final = (0.6, 0.08, 0.01, 0.3)  # the same at the start
@@ -34,29 +35,6 @@ SEARCH: Final = (  # values of offset, heading, curvature and width of the searc
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Lane:
-    """Lane in the ego's frame at a moment.
-
-    Attributes:
-        offset: Place of its middle beside the middle of the ego, m to the left.
-        heading: Slope of its middle there.
-        curvature: 1/m, positive to the left.
-        width: m.
-        confidence: Share of certainty that its markings were there in this image, 0 to 1.
-    """
-
-    offset: float
-    heading: float
-    curvature: float
-    width: float
-    confidence: float
-
-    def middle(self, ahead: float) -> float:
-        """Return the place of the middle of the lane `ahead` m in front, m to the left."""
-        return self.offset + self.heading * ahead + 0.5 * self.curvature * ahead * ahead
-
-
 class LaneFilter:
     """Estimate of the lane of one ego over time.
 
@@ -70,7 +48,7 @@ class LaneFilter:
         self.covariance: F64 = np.diag(np.square(INITIAL))
         ahead = grid.ahead
         ones = np.ones_like(ahead)
-        self._row_weight = np.minimum(FULL_WEIGHT / ahead, 1.0) ** 2
+        self._row_weight = np.minimum(FULL_WEIGHT / ahead, 1.0) ** 2 * grid.row_step / NOISE_STEP
         # Rows of the measurement matrix of the left line; the right line differs in the sign of the width.
         self._left = np.stack([ones, ahead, 0.5 * ahead**2, 0.5 * ones], 1)
         self._right = self._left * [1.0, 1.0, 1.0, -1.0]
@@ -94,11 +72,11 @@ class LaneFilter:
         steps = seconds / STEP
         self.covariance = motion @ self.covariance @ motion.T + np.diag(np.square(CHANGE)) * steps
 
-    def held(self) -> Lane | None:
+    def held(self) -> PerceivedLane | None:
         """Return the predicted lane, without confidence; None as long as none was found."""
-        return None if self.state is None else Lane(*self.state.tolist(), 0.0)
+        return None if self.state is None else PerceivedLane(*self.state.tolist(), 0.0)
 
-    def correct(self, strength: F32) -> Lane | None:
+    def correct(self, strength: F32) -> PerceivedLane | None:
         """Correct the lane with the markings of an image.
 
         Args:
@@ -130,7 +108,7 @@ class LaneFilter:
             confidence = total / (total + HALF_ROWS)
             covariance = np.linalg.inv(information)
         self.covariance = 0.5 * (covariance + covariance.T)
-        return Lane(*self.state.tolist(), confidence)
+        return PerceivedLane(*self.state.tolist(), confidence)
 
 
 def line_places(strength: F32, grid: TopView, line: F64, window: float) -> tuple[F64, F64]:
