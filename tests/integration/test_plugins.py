@@ -188,6 +188,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "size": 128,
         "floor": 0.0,
     },
+    "reality": {"detectors": ["example-smoothed"]},
     "tour": {"parts": [{"name": "part", "suite": "COIN ssad_example.kind:Coin"}]},
     "example-coin": {"kind": "ssad_example.kind:Coin"},
 }
