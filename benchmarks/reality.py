@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 import ssad
-from benchmarks.insert import DOCS, insert
+from benchmarks.insert import DOCS
 from ssad.core.checkpoints import read_card
 from ssad.core.safeio import dump_json
 from ssad.detectors import SHIPPED
@@ -164,10 +164,10 @@ def probe(entry: Mapping[str, Any]) -> str:
     mean = {name: f"{row['metrics']['score']:.2f}" for name, row in {"clean": clean, **rows}.items()}
     hidden = {name: f"{100 * row['metrics']['hidden']:.0f} %" for name, row in rows.items()}
     return (
-        f"On {clean['cars']} real cars in photographs `{detector}` has a mean score of {mean['clean']} without a print, "
-        f"{mean['random']} with random patches, {mean['shuffled']} with shuffled ones and {mean['trained']} with the "
-        f"shipped Adv. Patch. Of the cars that it finds, random patches hide {hidden['random']}, shuffled ones "
-        f"{hidden['shuffled']} and the trained one {hidden['trained']} ([all figures](../results/reality.md))."
+        f"On {clean['cars']} real cars in photographs `{detector}` has a mean score of {mean['clean']} without a "
+        f"print, {mean['random']} with random patches, {mean['shuffled']} with shuffled ones and {mean['trained']} "
+        f"with the shipped Adv. Patch. Of the cars that it finds, random patches hide {hidden['random']}, shuffled "
+        f"ones {hidden['shuffled']} and the trained one {hidden['trained']} ([all figures](../results/reality.md))."
     )
 
 
@@ -209,13 +209,14 @@ def write_page() -> None:
         f"> **Stored result.** Commit: {first['commit']}. Weights: {shown}. Torch: {first['torch']}. Make it anew: "
         "`python -m benchmarks.reality DATA --human ARCHIVE`, then `python -m benchmarks.reality --page`.",
         "",
-        "The shipped detectors learned from images that SSAD renders. None of them has seen a photograph. This page says "
-        "what they find in photographs, beside a detector that learned from photographs (COCO): the CenterNet of the npm "
-        "package `@vladmandic/human` ([how to use it](../how-to/use-detectors.md#a-detector-that-learned-from-photographs)).",
+        "The shipped detectors learned from images that SSAD renders. None of them has seen a photograph. This page "
+        "says what they find in photographs, beside a detector that learned from photographs (COCO): the CenterNet of "
+        "the npm package `@vladmandic/human` "
+        "([how to use it](../how-to/use-detectors.md#a-detector-that-learned-from-photographs)).",
         "",
-        "How to read it: [test detectors on photographs](../how-to/test-on-photographs.md). Nothing in the suite `reality` "
-        "was chosen on photographs, and no detector of SSAD is trained on them. Brackets: 95 % interval by the bootstrap "
-        "over photographs.",
+        "How to read it: [test detectors on photographs](../how-to/test-on-photographs.md). Nothing in the suite "
+        "`reality` was chosen on photographs, and no detector of SSAD is trained on them. Brackets: 95 % interval by "
+        "the bootstrap over photographs.",
     ]
     for name, entry in stored.items():
         data = entry["data"]
@@ -225,9 +226,9 @@ def write_page() -> None:
             "",
             *detector_table(entry),
             "",
-            f"At a score of {entry['score']:g} and an IoU of one half; AP50 over all scores. The score margin is the mean "
-            f"score with which an object is found (0: not at all), less {entry['score']:g}. Each detector is scored on "
-            "the classes that it knows.",
+            f"At a score of {entry['score']:g} and an IoU of one half; AP50 over all scores. The score margin is the "
+            f"mean score with which an object is found (0: not at all), less {entry['score']:g}. Each detector is "
+            "scored on the classes that it knows.",
             "",
             "### By class",
             "",
@@ -239,25 +240,18 @@ def write_page() -> None:
             "",
             "### Textures and their controls on the cars",
             "",
-            "Each texture is pasted onto the rear, or the front, of every car that shows it: at least 40 px high, not cut, "
-            "not behind another object. Random and shuffled squares are means of three draws. Where a control hides as "
-            "much as the texture, the texture proves nothing. Fewer than five photographs with such cars have no interval.",
+            "Each texture is pasted onto the rear, or the front, of every car that shows it: at least 40 px high, not "
+            "cut, not behind another object. Random and shuffled squares are means of three draws. Where a control "
+            "hides as much as the texture, the texture proves nothing. Fewer than five photographs with such cars have "
+            "no interval.",
             "",
             *texture_table(entry),
         ]
     lines += ["", "## Log of the evaluations", "", *evaluations(), ""]
     PAGE.write_text("\n".join(lines))
-    insert("reference/physical.md", "probe on real cars", ["", probe(first), ""])
-    quoted = [
-        "",
-        f"On the {first['data']['photographs']} photographs of [the results](results/reality.md) `yolov5n` finds "
-        f"{summary_of(first, 'yolov5n')}"
-        + (f"; a detector that learned from photographs, {summary_of(first, PHOTO)}" if _has(first, PHOTO) else "")
-        + ".",
-        "",
-    ]
-    insert("explanation/limits.md", "photographs", [line.replace("(results/", "(../results/") for line in quoted])
-    insert("../README.md", "photographs", [line.replace("(results/", "(docs/results/") for line in quoted])
+    insert_sentence("reference/physical.md", "probe on real cars", probe(first))
+    for page, folder in (("explanation/limits.md", "../results"), ("../README.md", "docs/results")):
+        insert_sentence(page, "photographs", quotation(first, folder))
     for row in clean_rows(first):
         card = SHIPPED / f"{row['detector']}.json"
         if card.is_file() and read_card(card).hash.startswith(first["weights"][row["detector"]].split()[0]):
@@ -266,6 +260,29 @@ def write_page() -> None:
             content["photographs"] = {name: value for name, value in figures.items() if value is not None}
             content.setdefault("learned_from", "images that SSAD rendered; no photographs")
             card.write_text(dump_json(dict(sorted(content.items())), indent=1) + "\n")
+
+
+def quotation(entry: Mapping[str, Any], folder: str) -> str:
+    """Return what detectors find in photographs, in a sentence for another page.
+
+    Args:
+        entry: Results on some photographs.
+        folder: Folder of the page of results, as a link from the other page.
+    """
+    compared = (
+        f"; a detector that learned from photographs finds {summary_of(entry, PHOTO)}" if _has(entry, PHOTO) else ""
+    )
+    return (
+        f"In the {entry['data']['photographs']} photographs of [the results]({folder}/reality.md) `yolov5n` finds "
+        f"{summary_of(entry, 'yolov5n')}{compared}."
+    )
+
+
+def insert_sentence(page: str, mark: str, sentence: str) -> None:
+    """Put a sentence between `<!-- MARK: begin -->` and `<!-- MARK: end -->` of a page, in its line."""
+    path, begin, end = DOCS / page, f"<!-- {mark}: begin -->", f"<!-- {mark}: end -->"
+    before, _, after = path.read_text().partition(begin)
+    path.write_text(before + begin + sentence + end + after.partition(end)[2])
 
 
 def _has(entry: Mapping[str, Any], detector: str) -> bool:
