@@ -13,6 +13,7 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
@@ -112,15 +113,20 @@ class RenderQuality:
         fine: A fine shadow map around the focus.
         contact: Bodies occlude the light of the sky on the ground.
         lamps: Lamps of the street and of objects, and their shadows.
+        effects: Names of further effects that are on, see `ssad.rendering.camera.effects`.
     """
 
     shadows: bool = True
     fine: bool = True
     contact: bool = True
     lamps: bool = True
+    effects: frozenset[str] = DEFAULT_EFFECTS
+
+    def __post_init__(self) -> None:
+        check_effects(self.effects)
 
 
-PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False)
+PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False, effects=NO_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +163,7 @@ class Rendering:
         surface: Surfaces that the pixels show; None unless requested.
         material: Row of each pixel's material in `RenderScene.material_names` [B, H, W]; -1: sky. None unless
             requested.
+        effects: Effects that were on.
     """
 
     image: U8
@@ -167,6 +174,7 @@ class Rendering:
     fragments: Any
     surface: SurfaceMap | None = None
     material: I32 | None = None
+    effects: frozenset[str] = NO_EFFECTS
 
 
 @lru_cache(maxsize=256)
@@ -415,7 +423,7 @@ def render(
         inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
         material = found_materials.numpy()
-    return Rendering(*arrays, np.array(exposures), fragments, exported, material)
+    return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")
