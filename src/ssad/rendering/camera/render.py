@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,11 +21,13 @@ from ssad.rendering.camera.kernels import sensor as sensing
 from ssad.rendering.camera.lamps import (
     LAMP_NEAR,
     LAMP_SHADOWS,
+    NIGHT_LUX,
     SceneLamp,
     lamp_lens,
     lamp_strength,
     nearby_lights,
     struct_array,
+    with_low_beams,
 )
 from ssad.rendering.camera.scene import (
     DrawCalls,
@@ -45,6 +47,7 @@ from ssad.rendering.camera.sensor import (
     noise_levels,
     point_spread,
 )
+from ssad.rendering.camera.street_lighting import UNLIT, UNLIT_LUX, check_lighting
 
 NEAR = 0.15  # m
 FAR = 500.0
@@ -66,6 +69,11 @@ class SceneWeather:
         wet: Wetness of the ground, 0 to 1.
         exposure: Stops relative to the exposure that suits the light.
         turn: Offset of the clouds.
+        lighting: Class of the street lighting at night (see `ssad.rendering.camera.street_lighting`); "": lamps that
+            meet no class, with 3.5 lux on average.
+
+    Raises:
+        UnknownNameError: There is no such class.
     """
 
     sun_height: float = 0.7
@@ -75,6 +83,10 @@ class SceneWeather:
     wet: float = 0.0
     exposure: float = 0.0
     turn: float = 0.0
+    lighting: str = ""
+
+    def __post_init__(self) -> None:
+        check_lighting(self.lighting)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,11 +210,16 @@ def scene_light(weather: SceneWeather) -> tuple[tuple[Any, ...], float]:
     sun_colour = np.array([1.0, 0.72 + 0.25 * warmth, 0.42 + 0.48 * warmth]) * 2.6 * sun_share
     cloud_colour = np.array([0.88, 0.92, 0.98])
     cloud_share = weather.clouds**2
-    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - cloud_share) + cloud_colour * cloud_share) * (0.010 + 0.9 * daylight)
+    zenith_colour = np.array([0.24, 0.46, 0.98]) * (1 - cloud_share) + cloud_colour * cloud_share
+    horizon_colour = np.array([0.95, 1.12, 1.30]) * (1 - cloud_share) + 1.15 * cloud_colour * cloud_share
+    night_zenith, night_horizon = 0.010, 0.016
+    if weather.lighting == UNLIT:
+        # The same weights of zenith and horizon as in the shading of level ground.
+        level = 0.65 * night_zenith * zenith_colour.mean() + 0.35 * night_horizon * horizon_colour.mean()
+        night_zenith, night_horizon = (night * UNLIT_LUX * NIGHT_LUX / level for night in (night_zenith, night_horizon))
+    zenith = zenith_colour * (night_zenith + 0.9 * daylight)
     horizon_glow = np.array([1.0, 0.55, 0.30]) * (1 - warmth) * 0.5 * daylight
-    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - cloud_share) + 1.15 * cloud_colour * cloud_share) * (
-        0.016 + 0.9 * daylight
-    )
+    horizon = horizon_colour * (night_horizon + 0.9 * daylight)
     horizon = horizon + horizon_glow * (1 - weather.clouds)
     # Light that the ground reflects upwards.
     ground = 0.16 * (horizon + 0.5 * sun_colour * max(sun[2], 0))
@@ -272,6 +289,7 @@ class _VisibilityPass:
         draw_table.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
         draw_table.tags = wp.array(draws.tags, dtype=int, device=device)
         draw_table.lit = wp.array(draws.lit, dtype=int, device=device)
+        draw_table.split = wp.array(draws.splits, dtype=wp.vec2, device=device)
         self.lens = wp.array(lens, dtype=wp.vec4, device=device)
         views = wp.array(draws.views, dtype=int, device=device)
         height, width = size[0] * scale, size[1] * scale
@@ -356,8 +374,11 @@ def render(
         view_light, exposure = scene_light(view.weather)
         lights.append(view_light)
         exposures.append(exposure)
+    views = [_with_effects(entry, quality.effects) for entry in views]
     poses = np.array([entry.pose for entry in views], np.float64)
     bodies = collect_objects([entry.objects for entry in views])
+    if "vehicle-signals" not in quality.effects:
+        bodies = replace(bodies, signals=np.zeros_like(bodies.signals))
     # Beyond six extinction lengths fog hides everything.
     far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
     draws = scene.gather_draw_calls(
@@ -367,6 +388,7 @@ def render(
         axes=poses[:, :3, 2],
         reach=(70.0, 180.0),
         far=far_limits,
+        street_lit=np.array([entry.weather.lighting != UNLIT for entry in views]),
     )
     visible = _VisibilityPass(scene, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
     shadows = _sun_shadows(scene, views, bodies, [view_light[0] for view_light in lights], quality)
@@ -424,6 +446,15 @@ def render(
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
         material = found_materials.numpy()
     return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
+
+
+def _with_effects(view: View, effects: frozenset[str]) -> View:
+    """Return the view without the objects of effects that are off, and with the pattern of head lamps if it is on."""
+    if "low-beams" in effects and view.lamps:
+        view = replace(view, lamps=with_low_beams(view.lamps))
+    if all(not entry.effect or entry.effect in effects for entry in view.objects):
+        return view
+    return replace(view, objects=tuple(entry for entry in view.objects if not entry.effect or entry.effect in effects))
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")
@@ -558,7 +589,14 @@ def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
 
 def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, quality: RenderQuality) -> Any:
     """Build lamps with their shadow maps, and the bodies that occlude the sky from the ground."""
-    near_light = nearby_lights(scene, views, bodies, lamps=quality.lamps, contact=quality.contact)
+    near_light = nearby_lights(
+        scene,
+        views,
+        bodies,
+        lamps=quality.lamps,
+        contact=quality.contact,
+        low_beams="low-beams" in quality.effects,
+    )
     shadow_lamps = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not shadow_lamps:
         near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=scene.device)
