@@ -20,11 +20,12 @@ from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.rig import rig_camera
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
-from ssad.rendering.episode_scene import LENSES, AgentPoses, agent_poses
+from ssad.rendering.episode_scene import AgentPoses, agent_poses
 from ssad.rendering.lidar import Lidar
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.onboard import Onboard
 from ssad.rendering.scene_objects import PHASES
+from ssad.rendering.signal_heads import LENSES
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage

@@ -82,9 +82,7 @@ def sample_road(street: Street, *, count: int = SAMPLES) -> RoadSamples:
     is_asphalt = np.array([material.name.startswith("asphalt") for material in street.materials])[street.material]
     near_faces = np.unique(street.order[: street.offset[0, -2]])
     triangles = street.vertices[street.faces[near_faces[is_asphalt[near_faces]]]].astype(np.float64)
-    areas = 0.5 * np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
+    areas = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     draws = generator("street lighting", street.name, street.style)
     chosen = triangles[draws.choice(len(areas), count, p=areas / areas.sum())]
     first, second = draws.random((2, count, 1))

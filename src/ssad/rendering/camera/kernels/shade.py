@@ -533,9 +533,7 @@ def shade_pixel(
                 if surface.lamp > 0:
                     to_camera = draw_samples.matrices[hit.draw]
                     leftward = wp.vec3(to_camera[0, 1], to_camera[1, 1], to_camera[2, 1])
-                    side = wp.dot(
-                        leftward, ray * hit.z - wp.vec3(to_camera[0, 3], to_camera[1, 3], to_camera[2, 3])
-                    )
+                    side = wp.dot(leftward, ray * hit.z - wp.vec3(to_camera[0, 3], to_camera[1, 3], to_camera[2, 3]))
                 emission = lamp_emission(
                     surface, draw_samples.lit[hit.draw], side, draw_samples.split[hit.draw], light.lamps
                 )
