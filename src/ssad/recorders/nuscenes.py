@@ -41,6 +41,7 @@ from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.lidar import HDL32E, points_in_boxes, sweep
 from ssad.rendering.scene_objects import PlacedObject, SceneObjects, place_objects
+from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street.model import Street
 from ssad.world.roads import is_town, load_town
 
@@ -233,13 +234,14 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
         if step % KEY == 0 or (step % sweep_spacing == 0 and step % KEY <= sweep_spacing * recording.sweeps)
     ]
     # Most bodies of a town are never in view; building only the visible ones saves time and memory.
-    scene = RenderScene(
-        street, population.meshes.select(_meshes_near(population, trace, steps)), device=recording.device
-    )
+    meshes = [*population.meshes.select(_meshes_near(population, trace, steps)), *head_meshes()]
+    heads = SignalHeads(graph, street, len(population.meshes))
+    scene = RenderScene(street, meshes, device=recording.device)
     steps_per_call = GPU_STEPS if recording.device != "cpu" else 1
     for start in range(0, len(steps), steps_per_call):
         moments = [
-            _Moment.of(step, population, trace, cameras, weather, key) for step in steps[start : start + steps_per_call]
+            _Moment.of(step, population, heads, trace, cameras, weather, key)
+            for step in steps[start : start + steps_per_call]
         ]
         for moment, shares in _render_moments(scene, moments, files, number, batched=recording.device != "cpu"):
             sweep_end = moment.now
@@ -309,6 +311,7 @@ class _Moment:
     def of(  # noqa: PLR0917
         step: int,
         population: SceneObjects,
+        heads: SignalHeads,
         trace: EpisodeTrace,
         cameras: list[Camera],
         weather: SceneWeather,
@@ -326,6 +329,7 @@ class _Moment:
             )
             noise_seed = int(digest("noise", *key, step, camera_index)[:7], 16)
             lamps = own_lamps(ego, weather)
+            scene_objects += heads.trace_lights(trace, exposure_time, ego[:2, 3])
             views.append(View(camera, ego @ camera.to_ego, scene_objects, weather, SENSOR, noise_seed, lamps))
             times.append(exposure_time)
             egos.append(ego)

@@ -65,6 +65,7 @@ from ssad.rendering.scene_objects import (
     occupy_standing,
     place_objects,
 )
+from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street_signs import free_places, plate_and_post
 from ssad.rendering.target import STANDING, TargetCar, TargetSign, TargetWalker, class_of_target
 from ssad.world.roads import load_town
@@ -91,6 +92,7 @@ class _TargetDrive:
         trace: The drive.
         population: Bodies of the drive.
         scene: Street and bodies, ready to be rendered.
+        heads: Signals of the street.
         targets: Bodies that play the target in turn.
         places: Possible places of a standing target.
     """
@@ -100,6 +102,7 @@ class _TargetDrive:
     trace: EpisodeTrace
     population: SceneObjects
     scene: RenderScene
+    heads: SignalHeads
     targets: tuple[ObjectBody, ...]
     places: tuple[Place, ...] = ()
 
@@ -129,7 +132,8 @@ def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> 
         key,
         trace,
         population,
-        RenderScene(street, population.meshes, device=recording.device),
+        RenderScene(street, [*population.meshes, *head_meshes()], device=recording.device),
+        SignalHeads(graph, street, len(population.meshes)),
         targets,
         places,
     )
@@ -338,7 +342,8 @@ def _view(
     lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.recording.mode == "drive" else ()
     focus_point = float(viewpoint.target[0, 3]), float(viewpoint.target[1, 3])
     other_parts = (SceneObject(mesh, viewpoint.target, target.paint) for mesh in target.meshes[1:])
-    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects))
+    lights = stage_set.heads.trace_lights(stage_set.trace, viewpoint.time, viewpoint.camera[:2, 3])
+    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects), *lights)
     return View(camera, viewpoint.camera, scene_objects, viewpoint.weather, SENSOR, noise_seed, lamps, focus_point)
 
 

@@ -6,7 +6,7 @@ The result does not depend on the other episodes that share a scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -16,7 +16,7 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose, upright_poses
 from ssad.core.seeding import generator
-from ssad.core.types import F32, F64, I32, U8, AgentKind, Body, Bool, Episode, EpisodeTrace
+from ssad.core.types import F32, F64, I32, U8, Body, Bool, Episode, EpisodeTrace
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.rendering.camera.scene import RenderScene, SceneObject
@@ -25,13 +25,12 @@ from ssad.rendering.scene_objects import PHASES, STRIDE, GroundOccupancy
 from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import KINDS, REACH, street_signs
-from ssad.rendering.vehicle_signals import flashing, vehicle_signals
-from ssad.world.models import MODELS, agent_model, agent_size, stated_size, trace_sizes
+from ssad.rendering.vehicle_signals import flashing, trace_signals
+from ssad.world.models import agent_model, agent_size, stated_size, trace_sizes
 from ssad.world.rollout import route_signals
 
 VARIANTS: Final = 4  # bodies that play a model
 CYCLED: Final = ("pedestrian", "bicycle")  # kinds of body that have a walking cycle, or pedals
-WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
 
 BodyKey = tuple[str, int, int, tuple[float, ...]]
 """Model, which of its `VARIANTS`, which of the `PHASES` of its cycle, and its size if that is not the model's."""
@@ -254,24 +253,14 @@ class EpisodeScene:
 def agent_poses(trace: EpisodeTrace) -> list[AgentPoses]:
     """Return the poses of all agents at each step of a trace, with the signals of vehicles."""
     pose = np.stack([trace.x, trace.y, trace.yaw], -1)
-    turn = trace.turn_signal if trace.turn_signal.size else np.zeros(trace.speed.shape, np.int8)
-    has_lamps = with_lamps(trace.models)
-    agents = np.arange(len(trace.models))
+    agents, signals = np.arange(len(trace.models)), trace_signals(trace)
     walked = np.zeros(pose.shape[1])
     moments = []
     for step in range(len(pose)):
         walked = walked_distance(walked, pose[max(step - 1, 0)], pose[step])
-        signals = vehicle_signals(
-            trace.speed[max(step - 1, 0)], trace.speed[step], walked, turn[step], trace.dt, has_lamps
-        )
-        lamps = flashing(signals, step * trace.dt, agents)
+        lamps = flashing(signals[step], step * trace.dt, agents)
         moments.append(AgentPoses(step, pose[step], trace.active[step], walked, trace.signal[step], lamps))
     return moments
-
-
-def with_lamps(models: Sequence[str]) -> Bool:
-    """Return whether agents of models have head lamps, stop lamps and indicators [A]."""
-    return np.array([MODELS[model].kind in WITH_LAMPS for model in models], bool)
 
 
 def _cycles(model: str) -> bool:

@@ -32,16 +32,14 @@ from ssad.rendering.camera.scene_edit import SceneEdit, render_with
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.sensor import SensorModel as Response
 from ssad.rendering.episode_scene import (
-    WITH_LAMPS,
     AgentPoses,
     Appearance,
     EpisodeScene,
     agent_poses,
     walked_distance,
-    with_lamps,
 )
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
-from ssad.rendering.vehicle_signals import flashing, vehicle_signals
+from ssad.rendering.vehicle_signals import WITH_LAMPS, flashing, vehicle_signals, with_lamps
 from ssad.world.models import MODELS, agent_size
 from ssad.world.rollout import has_drivers
 
