@@ -13,6 +13,7 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
+from ssad.rendering.camera.glare import add_suns, scatter
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
@@ -404,6 +405,7 @@ def render(
         fragments = output.fragments[:count].numpy() if count else fragments
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
+    add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
     if download:
@@ -586,9 +588,11 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
     """
     device, (count, height, width) = radiance.device, radiance.shape
     rows: Any = []
+    for view in views:
+        view.sensor.check_size(height, width)
+    radiance = scatter(radiance, [view.sensor for view in views])
     for view, exposure in zip(views, exposures, strict=True):
         sensor = view.sensor
-        sensor.check_size(height, width)
         photons, dark_noise = noise_levels(sensor.noise, exposure)
         centre_weight, side_weight = point_spread(sensor.blur)
         rows.append(

@@ -3,7 +3,8 @@
 Constants shared by both engines: `ssad.rendering.camera.kernels.sensor` (Warp, for `render`) and
 `ssad.rendering.camera.torch_sensor` (torch, with gradients). The chain is
 
-1. light = radiance * exposure, spread by the lens over 3 x 3 pixels;
+1. light = radiance * exposure, scattered by the lens (`ssad.rendering.camera.glare`) and spread by it over 3 x 3
+   pixels;
 2. one colour for each photosite (Bayer's RGGB, red at row 0 and column 0), or all three without a mosaic;
 3. photon noise and read noise; then a full photosite holds no more;
 4. the missing colours from the neighbours (Malvar, He and Cutler, ICASSP 2004);
@@ -28,6 +29,9 @@ DAY_EXPOSURE: Final = 0.5  # exposure on a clear day
 READ_NOISE: Final = 0.2  # deviation without light, in parts of that at full light
 WIDEST_BLUR: Final = 0.7  # px; three taps hold no wider spread without a ringing response
 SMALLEST: Final = 4  # px along a side, so that borders can be mirrored
+MOST_GLARE: Final = 3.0  # times the glare of the eye; beyond it, hardly any light would reach its pixel
+MOST_FLARE: Final = 100.0  # reflections of 5 % in place of 0.5 %, as of uncoated glass
+EVERYWHERE: Final = 1 << 20  # px, more than any image has
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,9 @@ class SensorModel:
     mosaic: bool = True
     noise: float = 0.0
     full: float = BRIGHTEST
+    glare: float = 0.0
+    flare: float = 0.0
+    focal: float = 1.1
 
     def __post_init__(self) -> None:
         if not 0 <= self.blur <= WIDEST_BLUR:
@@ -59,10 +66,24 @@ class SensorModel:
             raise ConfigError(f"a noise of {self.noise}: it must be a finite number of at least 0")
         if not 0 < self.full <= BRIGHTEST:
             raise ConfigError(f"photosites full at {self.full}: it must be above 0 and at most {BRIGHTEST:g}")
+        if not 0 <= self.glare <= MOST_GLARE or not 0 <= self.flare <= MOST_FLARE:
+            raise ConfigError(
+                f"a glare of {self.glare} and a flare of {self.flare}: "
+                f"they must be in 0..{MOST_GLARE:g} and 0..{MOST_FLARE:g}"
+            )
+        if not (math.isfinite(self.focal) and self.focal > 0):
+            raise ConfigError(f"a focal length of {self.focal} widths: it must be a finite number above 0")
+
+    @property
+    def scatters(self) -> bool:
+        """True if light reaches pixels far from its own."""
+        return self.glare > 0 or self.flare > 0
 
     @property
     def reach(self) -> int:
         """Distance in px at which the light of a pixel can change a code."""
+        if self.scatters:
+            return EVERYWHERE
         return (1 if self.blur > 0 else 0) + (2 if self.mosaic else 0)
 
     def check_size(self, height: int, width: int) -> None:
