@@ -13,7 +13,8 @@ to 1. What a lens scatters out of the image and into it is thereby the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -38,7 +39,23 @@ GHOSTS: Final = (
     (-1.7, (1.0, 0.90, 0.60)),
 )
 GHOST_LEVEL: Final = 2  # level of the pyramid to which ghosts are added
+BLOOM: Final = 0.15  # glare of the effect `bloom`: a clean lens behind a clean windscreen
+FLARE: Final = 1.0  # flare of the effect `flare`
 SUN_RADIUS: Final = math.radians(0.2666)  # rad
+
+
+def with_lens_effects(sensor: SensorModel, effects: Collection[str]) -> SensorModel:
+    """Return a sensor with the glare and flare of the effects `bloom` and `flare`, unless it has its own.
+
+    Args:
+        sensor: The sensor.
+        effects: Names of effects, see `ssad.rendering.camera.effects`.
+    """
+    return replace(
+        sensor,
+        glare=sensor.glare or BLOOM * ("bloom" in effects),
+        flare=sensor.flare or FLARE * ("flare" in effects),
+    )
 
 
 @lru_cache(maxsize=64)
@@ -117,9 +134,7 @@ def direct_share(sensor: SensorModel, weights: F64) -> float:
 
 def ghost_lights(sensor: SensorModel) -> list[tuple[float, tuple[float, ...]]]:
     """Return the size of each ghost, and its radiance for a radiance of 1, RGB."""
-    return [
-        (size, tuple(sensor.flare * REFLECTION**2 * value / size**2 for value in tint)) for size, tint in GHOSTS
-    ]
+    return [(size, tuple(sensor.flare * REFLECTION**2 * value / size**2 for value in tint)) for size, tint in GHOSTS]
 
 
 def ghost_source_level(height: int, width: int) -> int:
@@ -148,7 +163,9 @@ def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
         pyramid_weights(height, levels), pyramid_weights(width, levels), strict=True
     ):
         half = wp.empty((count, len(row_weights), len(column_weights)), dtype=wp.vec3, device=device)
-        taps = [wp.array(values.astype(np.float32), dtype=float, device=device) for values in (row_weights, column_weights)]
+        taps = [
+            wp.array(values.astype(np.float32), dtype=float, device=device) for values in (row_weights, column_weights)
+        ]
         wp.launch(kernels.shrink, dim=half.shape[:2], inputs=[pyramid[-1], *taps], outputs=[half], device=device)
         pyramid.append(half)
     ghost_level, scattered = min(GHOST_LEVEL, levels), pyramid[-1]
@@ -170,7 +187,10 @@ def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
             ]
             wp.launch(kernels.add_ghosts, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
         scattered = total
-    shares = [direct_share(sensor, values) if sensor.scatters else 1.0 for sensor, values in zip(sensors, weights, strict=True)]
+    shares = [
+        direct_share(sensor, values) if sensor.scatters else 1.0
+        for sensor, values in zip(sensors, weights, strict=True)
+    ]
     direct = wp.array(np.array(shares, np.float32), dtype=float, device=device)
     out = wp.empty(radiance.shape, dtype=wp.vec3, device=device)
     wp.launch(kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=device)
@@ -190,7 +210,8 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
         lights: Light of each view, see `ssad.rendering.camera.kernels.sky.Light`.
     """
     height, width = radiance.shape[1:]
-    rows, side = [], 0
+    rows: Any = []
+    side = 0
     for view, (fx, fy, cx, cy), light in zip(views, lens, lights, strict=True):
         x, y, z = view.pose[:3, :3].T @ np.asarray(light[0])
         strength = np.asarray(light[1]) * (1.0 - 0.9 * light[6])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,7 +13,8 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
-from ssad.rendering.camera.glare import add_suns, scatter
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
+from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
@@ -113,15 +114,20 @@ class RenderQuality:
         fine: A fine shadow map around the focus.
         contact: Bodies occlude the light of the sky on the ground.
         lamps: Lamps of the street and of objects, and their shadows.
+        effects: Names of further effects that are on, see `ssad.rendering.camera.effects`.
     """
 
     shadows: bool = True
     fine: bool = True
     contact: bool = True
     lamps: bool = True
+    effects: frozenset[str] = DEFAULT_EFFECTS
+
+    def __post_init__(self) -> None:
+        check_effects(self.effects)
 
 
-PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False)
+PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False, effects=NO_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +164,7 @@ class Rendering:
         surface: Surfaces that the pixels show; None unless requested.
         material: Row of each pixel's material in `RenderScene.material_names` [B, H, W]; -1: sky. None unless
             requested.
+        effects: Effects that were on.
     """
 
     image: U8
@@ -168,6 +175,7 @@ class Rendering:
     fragments: Any
     surface: SurfaceMap | None = None
     material: I32 | None = None
+    effects: frozenset[str] = NO_EFFECTS
 
 
 @lru_cache(maxsize=256)
@@ -333,6 +341,7 @@ def render(
     """
     if not views:
         raise ConfigError("no view to render")
+    views = [replace(view, sensor=with_lens_effects(view.sensor, quality.effects)) for view in views]
     size = (views[0].camera.height, views[0].camera.width)
     if any((entry.camera.height, entry.camera.width) != size for entry in views):
         raise ConfigError("views of one call must have one size")
@@ -417,7 +426,7 @@ def render(
         inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
         material = found_materials.numpy()
-    return Rendering(*arrays, np.array(exposures), fragments, exported, material)
+    return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")

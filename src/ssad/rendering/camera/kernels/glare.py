@@ -153,9 +153,7 @@ class SunDisc:
 
 
 @wp.kernel
-def add_sun(
-    discs: wp.array(dtype=SunDisc), tag: wp.array3d(dtype=int), side: int, radiance: wp.array3d(dtype=wp.vec3)
-):
+def add_sun(discs: wp.array(dtype=SunDisc), tag: wp.array3d(dtype=int), side: int, radiance: wp.array3d(dtype=wp.vec3)):
     """Add the disc of the sun to the sky of images: 4 x 4 samples a pixel, in squares of `side` px."""
     view, row, column = wp.tid()
     disc = discs[view]
