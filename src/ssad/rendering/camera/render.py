@@ -241,12 +241,20 @@ def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2] - 0.5), float(matrix[1, 2] - 0.5)
 
 
-@lru_cache(maxsize=1)
-def response() -> U8:
-    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
+@lru_cache(maxsize=256)
+def response(gamma: float = 1.0, contrast: float = 0.0) -> U8:
+    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB.
+
+    Args:
+        gamma: See `ssad.rendering.camera.sensor.SensorModel`.
+        contrast: See there.
+    """
     light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
     compressed = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
     encoded = np.where(compressed <= 0.0031308, compressed * 12.92, 1.055 * compressed ** (1 / 2.4) - 0.055)
+    if (gamma, contrast) != (1.0, 0.0):
+        encoded = np.clip(encoded, 0.0, 1.0) ** gamma
+        encoded = encoded + contrast * encoded * (1 - encoded) * (2 * encoded - 1)
     return np.asarray(np.rint(encoded * 255), np.uint8)
 
 
@@ -600,25 +608,37 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
     for view in views:
         view.sensor.check_size(height, width)
     radiance = scatter(radiance, [view.sensor for view in views])
+    tones = list(dict.fromkeys(view.sensor.tone for view in views))
     for view, exposure in zip(views, exposures, strict=True):
         sensor = view.sensor
         photons, dark_noise = noise_levels(sensor.noise, exposure)
         centre_weight, side_weight = point_spread(sensor.blur)
         rows.append(
-            (exposure, centre_weight, side_weight, sensor.full, photons, dark_noise, view.seed, int(sensor.mosaic))
+            (
+                tuple(exposure * factor for factor in sensor.balance),
+                centre_weight,
+                side_weight,
+                sensor.full,
+                photons,
+                dark_noise,
+                view.seed,
+                int(sensor.mosaic),
+                tones.index(sensor.tone),
+                sensor.saturation,
+            )
         )
     response_rows: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
     responses = wp.array(response_rows, dtype=sensing.Response, device=device)
-    curve = wp.array(response(), dtype=wp.uint8, device=device)
+    curves = wp.array(np.stack([response(*tone) for tone in tones]), dtype=wp.uint8, device=device)
     image = wp.empty((count, height, width, 3), dtype=wp.uint8, device=device)
     if any(view.sensor.mosaic for view in views):
         mosaic = wp.empty(radiance.shape, dtype=float, device=device)
         # A thread develops a 2 x 2 square of the mosaic.
         launch_shape = (count, (height + 1) // 2, (width + 1) // 2)
         wp.launch(sensing.expose, dim=launch_shape, inputs=[radiance, responses], outputs=[mosaic], device=device)
-        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curve], outputs=[image], device=device)
+        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curves], outputs=[image], device=device)
     if not all(view.sensor.mosaic for view in views):
-        inputs = [radiance, responses, curve]
+        inputs = [radiance, responses, curves]
         wp.launch(sensing.develop_plain, dim=radiance.shape, inputs=inputs, outputs=[image], device=device)
     return image
 

@@ -1,17 +1,18 @@
-"""Sensor model from light to codes: lens, colour mosaic, noise, full photosites.
+"""Sensor model from light to codes: lens, colour mosaic, noise, full photosites, colours and tones.
 
 Constants shared by both engines: `ssad.rendering.camera.kernels.sensor` (Warp, for `render`) and
 `ssad.rendering.camera.torch_sensor` (torch, with gradients). The chain is
 
-1. light = radiance * exposure, scattered by the lens (`ssad.rendering.camera.glare`) and spread by it over 3 x 3
-   pixels;
+1. light = radiance * exposure * white balance, scattered by the lens (`ssad.rendering.camera.glare`) and spread by it
+   over 3 x 3 pixels;
 2. one colour for each photosite (Bayer's RGGB, red at row 0 and column 0), or all three without a mosaic;
 3. photon noise and read noise; then a full photosite holds no more;
 4. the missing colours from the neighbours (Malvar, He and Cutler, ICASSP 2004);
-5. linear light to codes: linear to 0.8, a soft shoulder above, then sRGB.
+5. saturation: colours nearer to their grey or farther from it;
+6. linear light to codes: linear to 0.8, a soft shoulder above, then sRGB; then gamma and contrast.
 
-Light is white-balanced from the start, so that the three colours are full together. Borders are mirrored at the
-outermost pixel, which keeps the order of the mosaic.
+Light is white-balanced from the start, so that the three colours are full together unless the balance is off.
+Borders are mirrored at the outermost pixel, which keeps the order of the mosaic.
 """
 
 from __future__ import annotations
@@ -58,6 +59,10 @@ class SensorModel:
     glare: float = 0.0
     flare: float = 0.0
     focal: float = 1.1
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    saturation: float = 1.0
+    gamma: float = 1.0
+    contrast: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.blur <= WIDEST_BLUR:
@@ -73,6 +78,18 @@ class SensorModel:
             )
         if not (math.isfinite(self.focal) and self.focal > 0):
             raise ConfigError(f"a focal length of {self.focal} widths: it must be a finite number above 0")
+        if len(self.balance) != 3 or not all(0 < factor < math.inf for factor in self.balance):
+            raise ConfigError(f"a white balance of {self.balance}: it must be three finite factors above 0")
+        if not 0 <= self.saturation <= 2 or not 0.2 <= self.gamma <= 5 or not -0.5 <= self.contrast <= 0.9:
+            raise ConfigError(
+                f"a saturation of {self.saturation}, a gamma of {self.gamma} and a contrast of {self.contrast}: "
+                "they must be in 0..2, 0.2..5 and -0.5..0.9"
+            )
+
+    @property
+    def tone(self) -> tuple[float, float]:
+        """Gamma and contrast."""
+        return self.gamma, self.contrast
 
     @property
     def scatters(self) -> bool:
@@ -102,6 +119,7 @@ class SensorModel:
             )
 
 
+LUMINANCE: Final = (0.2126, 0.7152, 0.0722)  # weights of linear RGB in its grey (Rec. 709)
 DEFAULT_SENSOR: Final = SensorModel()
 PINHOLE: Final = SensorModel(blur=0.0, mosaic=False)  # its image is the curve of the light
 

@@ -35,6 +35,7 @@ from ssad.rendering.camera.sensor import (
     DEFAULT_SENSOR,
     GREEN,
     KNEE,
+    LUMINANCE,
     OPPOSITE,
     SHOULDER,
     SMALLEST,
@@ -284,6 +285,28 @@ class _Curve(torch.autograd.Function):
         return gradient
 
 
+def render_colours(light: Tensor, sensor: SensorModel) -> Tensor:
+    """Apply the saturation, the curve, the gamma and the contrast of a sensor.
+
+    Args:
+        light: Linear, [..., 3].
+        sensor: The sensor.
+
+    Returns:
+        sRGB in [0, 1].
+    """
+    if sensor.saturation != 1.0:
+        grey = (light * light.new_tensor(LUMINANCE)).sum(-1, keepdim=True)
+        light = light * sensor.saturation + grey * (1.0 - sensor.saturation)
+    encoded = curve(light)
+    if sensor.gamma != 1.0:
+        # The slope of a power below 1 has no bound at black.
+        encoded = encoded.clamp_min(1e-6) ** sensor.gamma
+    if sensor.contrast != 0.0:
+        encoded = encoded + sensor.contrast * encoded * (1 - encoded) * (2 * encoded - 1)
+    return encoded
+
+
 def draw_noise(shape: Sequence[int], sensor: SensorModel, generator: torch.Generator) -> Tensor:
     """Draw a sample of noise for `develop`: standard normal numbers.
 
@@ -344,8 +367,11 @@ def develop(
         noise = draw_noise(radiance.shape[:3], sensor, noise)
     if noise is not None:
         noise = noise.to(radiance)
-    raw = fill(photosites(radiance * exposure_factor, sensor), exposure, sensor, noise)
-    return curve(demosaic(raw) if sensor.mosaic else raw).permute(0, 3, 1, 2)
+    light = radiance * exposure_factor
+    if sensor.balance != (1.0, 1.0, 1.0):
+        light = light * light.new_tensor(sensor.balance)
+    raw = fill(photosites(light, sensor), exposure, sensor, noise)
+    return render_colours(demosaic(raw) if sensor.mosaic else raw, sensor).permute(0, 3, 1, 2)
 
 
 # ---------------------------------------------------------------- windows of changed pixels
