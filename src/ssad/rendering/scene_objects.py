@@ -18,7 +18,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
-from ssad.rendering.camera.scene import SceneObject
+from ssad.rendering.camera.scene import Finish, SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
@@ -100,6 +100,7 @@ class ObjectBody:
         active: [T] whether it is present.
         is_driven: [T] distance covered so far, m.
         is_parked: Whether it is a vehicle without a driver.
+        finish: Metallic paint, dirt and wear; None for a clean body.
     """
 
     tag: int
@@ -112,6 +113,7 @@ class ObjectBody:
     active: Bool
     is_driven: F64
     is_parked: bool = False
+    finish: Finish | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,11 +215,8 @@ class SceneObjects:
             )
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            placed.append(
-                PlacedObject(
-                    body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked)
-                )
-            )
+            scene_object = SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked, finish=body.finish)
+            placed.append(PlacedObject(body, pose, speed, scene_object))
         return placed
 
     def add(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
 from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
+from ssad.rendering.camera.kernels import finish as finish_kernels
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
@@ -30,6 +32,7 @@ from ssad.rendering.camera.lamps import (
 )
 from ssad.rendering.camera.scene import (
     DrawCalls,
+    Finish,
     ObjectTable,
     RenderScene,
     SceneObject,
@@ -392,9 +395,11 @@ def render(
     fragment_capacity = output.radiance.size * 2 if layer_tables.any or projecting else 1
     output.fragments = wp.empty(fragment_capacity, dtype=layer_kernels.Fragment, device=device)
     output.found = wp.zeros(1, dtype=int, device=device)
-    output.surface = int(surface)
+    finishes = _finishes(scene, views)
+    exports_surface = surface or finishes is not None
+    output.surface = int(exports_surface)
     for name in SURFACE:
-        setattr(output, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+        setattr(output, name, wp.zeros(shape if exports_surface else (1, 1, 1), dtype=wp.vec3, device=device))
     # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
     inputs = [
@@ -422,18 +427,23 @@ def render(
         fragments = output.fragments[:count].numpy() if count else fragments
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
+    material = None
+    if materials or finishes is not None:
+        found_materials = wp.empty(shape, dtype=int, device=device)
+        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
+        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
+        material = found_materials.numpy() if materials else None
+    if finishes is not None:
+        to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
+        surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
+        inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
+        wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
     add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
     if download:
         arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
     exported = _surface(output, np.array(lens), poses) if surface else None
-    material = None
-    if materials:
-        found_materials = wp.empty(shape, dtype=int, device=device)
-        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
-        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
-        material = found_materials.numpy()
     return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
 
 
@@ -457,6 +467,45 @@ def _surface(out: Any, lens: F64, poses: F64) -> SurfaceMap:
     camera_points = rays * np.where(is_solid, depth, 0.0)[..., None]
     position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], camera_points) + poses[:, None, None, :3, 3]
     return SurfaceMap(position=(position * is_solid[..., None]).astype(np.float32), **exported)
+
+
+def _finishes(scene: RenderScene, views: Sequence[View]) -> tuple[Any, Any] | None:
+    """Return the finishes of objects, and the row of each tag in each view; None if all are clean."""
+    rows: Any = []
+    places = []
+    for view_index, view in enumerate(views):
+        for scene_object in view.objects:
+            finish = scene_object.finish
+            if finish is None or finish == Finish() or scene_object.layers or scene_object.tag <= 0:
+                continue
+            from_world = np.linalg.inv(scene_object.pose)
+            lower, upper = scene.extent(scene_object.mesh)
+            places.append((view_index, scene_object.tag, len(rows)))
+            rows.append(
+                (
+                    from_world @ view.pose,
+                    tuple((from_world @ view.pose)[:3, 3]),
+                    max(float(upper[2] - lower[2]), 0.1),
+                    finish.metallic,
+                    finish.dirt,
+                    finish.wear,
+                    finish.seed % 4096,
+                    scene_object.tag,
+                )
+            )
+    if not rows:
+        return None
+    # Tags can be large numbers: their remainders, none of which two tags share, make a small table.
+    tags = {tag for _, tag, _ in places}
+    size = next(size for size in count(len(tags)) if len({tag % size for tag in tags}) == len(tags))
+    table = np.full((len(views), size), -1, np.int32)
+    for view_index, tag, row in places:
+        table[view_index, tag % size] = row
+    finish_rows: Any = np.array(rows, finish_kernels.Finish.numpy_dtype())  # type: ignore[attr-defined]
+    return (
+        wp.array(finish_rows, dtype=finish_kernels.Finish, device=scene.device),
+        wp.array(table, dtype=int, device=scene.device),
+    )
 
 
 def _sun_shadows(

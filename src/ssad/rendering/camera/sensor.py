@@ -78,7 +78,7 @@ class SensorModel:
             )
         if not (math.isfinite(self.focal) and self.focal > 0):
             raise ConfigError(f"a focal length of {self.focal} widths: it must be a finite number above 0")
-        if len(self.balance) != 3 or not all(0 < factor < math.inf for factor in self.balance):
+        if not all(0 < factor < math.inf for factor in self.balance):
             raise ConfigError(f"a white balance of {self.balance}: it must be three finite factors above 0")
         if not 0 <= self.saturation <= 2 or not 0.2 <= self.gamma <= 5 or not -0.5 <= self.contrast <= 0.9:
             raise ConfigError(
