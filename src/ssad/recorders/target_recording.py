@@ -14,6 +14,7 @@ from ssad.core.wording import counted
 from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
 from ssad.recorders.parts import PartsFolder
+from ssad.recorders.randomisation import NO_RANDOMISATION, Randomisation
 from ssad.rendering.target import Target, TargetSign, TargetWalker
 from ssad.world.roads import is_town
 
@@ -46,6 +47,7 @@ class TargetRecording:
         device: Device that renders.
         streets: See `drive_street`.
         weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
+        randomisation: What is drawn for each image and for each vehicle of a drive.
 
     Raises:
         ConfigError: A value is out of range, or the values do not fit together.
@@ -67,6 +69,7 @@ class TargetRecording:
     device: str = "cpu"
     streets: str = "town"
     weathers: tuple[str, ...] = ()
+    randomisation: Randomisation = NO_RANDOMISATION
 
     def __post_init__(self) -> None:
         for town in (*(name for name, _ in self.images), *self.held_out):
@@ -127,9 +130,10 @@ class TargetRecording:
         settings = asdict(replace(self, out=Path())) | {
             "clips": self.mode,
             "images": [list(pair) for pair in self.images],
+            "randomisation": self.randomisation.identity(),
         }
-        # An empty value is left out, so that recordings without weathers keep their identity.
-        excluded = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
+        # Empty values are left out, so that recordings without them keep their identity.
+        excluded = {"out", "mode"} | {name for name in ("weathers", "randomisation") if not settings[name]}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in settings.items()

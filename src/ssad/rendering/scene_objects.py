@@ -18,7 +18,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
-from ssad.rendering.camera.scene import SceneObject
+from ssad.rendering.camera.scene import Finish, SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
@@ -102,6 +102,7 @@ class ObjectBody:
         is_driven: [T] distance covered so far, m.
         is_parked: Whether it is a vehicle without a driver.
         signals: [T] `LampSignal` bits of its stop lamps and indicators, or [1] if they never shine.
+        finish: Metallic paint, dirt and wear; None for a clean body.
     """
 
     tag: int
@@ -115,6 +116,7 @@ class ObjectBody:
     is_driven: F64
     is_parked: bool = False
     signals: U8 = field(default_factory=lambda: np.zeros(1, np.uint8))
+    finish: Finish | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +219,15 @@ class SceneObjects:
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
             signals = int(flashing(body.signals[min(lower_step, len(body.signals) - 1)], time, body.tag))
-            scene_object = SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked, signals=signals)
+            scene_object = SceneObject(
+                mesh,
+                pose,
+                body.paint,
+                body.tag,
+                is_lit=not body.is_parked,
+                signals=signals,
+                finish=body.finish,
+            )
             placed.append(PlacedObject(body, pose, speed, scene_object))
         return placed
 

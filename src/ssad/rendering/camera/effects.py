@@ -40,6 +40,8 @@ EFFECTS: Final[dict[str, Effect]] = {
         Effect("vehicle-signals", "Stop lamps and indicators of vehicles shine."),
         Effect("low-beams", "The head lamps of vehicles have the pattern of a low beam, with a cut-off."),
         Effect("haze", "Distant surfaces fade into the light of the horizon in clear weather too."),
+        Effect("bloom", "The lens scatters light, so that the sun and lamps glow and veil what is near them."),
+        Effect("flare", "Bright lights have ghosts, which reflections between the surfaces of the lens make."),
     )
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
+from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
+from ssad.rendering.camera.kernels import finish as finish_kernels
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
@@ -31,6 +34,7 @@ from ssad.rendering.camera.lamps import (
 )
 from ssad.rendering.camera.scene import (
     DrawCalls,
+    Finish,
     ObjectTable,
     RenderScene,
     SceneObject,
@@ -257,12 +261,20 @@ def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2] - 0.5), float(matrix[1, 2] - 0.5)
 
 
-@lru_cache(maxsize=1)
-def response() -> U8:
-    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
+@lru_cache(maxsize=256)
+def response(gamma: float = 1.0, contrast: float = 0.0) -> U8:
+    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB.
+
+    Args:
+        gamma: See `ssad.rendering.camera.sensor.SensorModel`.
+        contrast: See there.
+    """
     light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
     compressed = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
     encoded = np.where(compressed <= 0.0031308, compressed * 12.92, 1.055 * compressed ** (1 / 2.4) - 0.055)
+    if (gamma, contrast) != (1.0, 0.0):
+        encoded = np.clip(encoded, 0.0, 1.0) ** gamma
+        encoded = encoded + contrast * encoded * (1 - encoded) * (2 * encoded - 1)
     return np.asarray(np.rint(encoded * 255), np.uint8)
 
 
@@ -358,6 +370,7 @@ def render(
     """
     if not views:
         raise ConfigError("no view to render")
+    views = [replace(view, sensor=with_lens_effects(view.sensor, quality.effects)) for view in views]
     size = (views[0].camera.height, views[0].camera.width)
     if any((entry.camera.height, entry.camera.width) != size for entry in views):
         raise ConfigError("views of one call must have one size")
@@ -404,9 +417,11 @@ def render(
     fragment_capacity = output.radiance.size * 2 if layer_tables.any or projecting else 1
     output.fragments = wp.empty(fragment_capacity, dtype=layer_kernels.Fragment, device=device)
     output.found = wp.zeros(1, dtype=int, device=device)
-    output.surface = int(surface)
+    finishes = _finishes(scene, views)
+    exports_surface = surface or finishes is not None
+    output.surface = int(exports_surface)
     for name in SURFACE:
-        setattr(output, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+        setattr(output, name, wp.zeros(shape if exports_surface else (1, 1, 1), dtype=wp.vec3, device=device))
     # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
     inputs = [
@@ -434,17 +449,23 @@ def render(
         fragments = output.fragments[:count].numpy() if count else fragments
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
+    material = None
+    if materials or finishes is not None:
+        found_materials = wp.empty(shape, dtype=int, device=device)
+        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
+        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
+        material = found_materials.numpy() if materials else None
+    if finishes is not None:
+        to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
+        surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
+        inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
+        wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
+    add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
     if download:
         arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
     exported = _surface(output, np.array(lens), poses) if surface else None
-    material = None
-    if materials:
-        found_materials = wp.empty(shape, dtype=int, device=device)
-        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
-        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
-        material = found_materials.numpy()
     return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
 
 
@@ -477,6 +498,45 @@ def _surface(out: Any, lens: F64, poses: F64) -> SurfaceMap:
     camera_points = rays * np.where(is_solid, depth, 0.0)[..., None]
     position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], camera_points) + poses[:, None, None, :3, 3]
     return SurfaceMap(position=(position * is_solid[..., None]).astype(np.float32), **exported)
+
+
+def _finishes(scene: RenderScene, views: Sequence[View]) -> tuple[Any, Any] | None:
+    """Return the finishes of objects, and the row of each tag in each view; None if all are clean."""
+    rows: Any = []
+    places = []
+    for view_index, view in enumerate(views):
+        for scene_object in view.objects:
+            finish = scene_object.finish
+            if finish is None or finish == Finish() or scene_object.layers or scene_object.tag <= 0:
+                continue
+            from_world = np.linalg.inv(scene_object.pose)
+            lower, upper = scene.extent(scene_object.mesh)
+            places.append((view_index, scene_object.tag, len(rows)))
+            rows.append(
+                (
+                    from_world @ view.pose,
+                    tuple((from_world @ view.pose)[:3, 3]),
+                    max(float(upper[2] - lower[2]), 0.1),
+                    finish.metallic,
+                    finish.dirt,
+                    finish.wear,
+                    finish.seed % 4096,
+                    scene_object.tag,
+                )
+            )
+    if not rows:
+        return None
+    # Tags can be large numbers: their remainders, none of which two tags share, make a small table.
+    tags = {tag for _, tag, _ in places}
+    size = next(size for size in count(len(tags)) if len({tag % size for tag in tags}) == len(tags))
+    table = np.full((len(views), size), -1, np.int32)
+    for view_index, tag, row in places:
+        table[view_index, tag % size] = row
+    finish_rows: Any = np.array(rows, finish_kernels.Finish.numpy_dtype())  # type: ignore[attr-defined]
+    return (
+        wp.array(finish_rows, dtype=finish_kernels.Finish, device=scene.device),
+        wp.array(table, dtype=int, device=scene.device),
+    )
 
 
 def _sun_shadows(
@@ -632,26 +692,40 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
     """
     device, (count, height, width) = radiance.device, radiance.shape
     rows: Any = []
+    for view in views:
+        view.sensor.check_size(height, width)
+    radiance = scatter(radiance, [view.sensor for view in views])
+    tones = list(dict.fromkeys(view.sensor.tone for view in views))
     for view, exposure in zip(views, exposures, strict=True):
         sensor = view.sensor
-        sensor.check_size(height, width)
         photons, dark_noise = noise_levels(sensor.noise, exposure)
         centre_weight, side_weight = point_spread(sensor.blur)
         rows.append(
-            (exposure, centre_weight, side_weight, sensor.full, photons, dark_noise, view.seed, int(sensor.mosaic))
+            (
+                tuple(exposure * factor for factor in sensor.balance),
+                centre_weight,
+                side_weight,
+                sensor.full,
+                photons,
+                dark_noise,
+                view.seed,
+                int(sensor.mosaic),
+                tones.index(sensor.tone),
+                sensor.saturation,
+            )
         )
     response_rows: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
     responses = wp.array(response_rows, dtype=sensing.Response, device=device)
-    curve = wp.array(response(), dtype=wp.uint8, device=device)
+    curves = wp.array(np.stack([response(*tone) for tone in tones]), dtype=wp.uint8, device=device)
     image = wp.empty((count, height, width, 3), dtype=wp.uint8, device=device)
     if any(view.sensor.mosaic for view in views):
         mosaic = wp.empty(radiance.shape, dtype=float, device=device)
         # A thread develops a 2 x 2 square of the mosaic.
         launch_shape = (count, (height + 1) // 2, (width + 1) // 2)
         wp.launch(sensing.expose, dim=launch_shape, inputs=[radiance, responses], outputs=[mosaic], device=device)
-        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curve], outputs=[image], device=device)
+        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curves], outputs=[image], device=device)
     if not all(view.sensor.mosaic for view in views):
-        inputs = [radiance, responses, curve]
+        inputs = [radiance, responses, curves]
         wp.launch(sensing.develop_plain, dim=radiance.shape, inputs=inputs, outputs=[image], device=device)
     return image
 

@@ -117,6 +117,33 @@ def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class Finish:
+    """Finish of a body beyond the colour of its paint.
+
+    Attributes:
+        metallic: Strength of the effect pigments in its paint, 0 to 1: surfaces that face the camera are lighter,
+            those that turn away darker, as flakes that lie flat in the paint make them.
+        dirt: Amount of dirt and dust, 0 to 1.
+        wear: Chalking, scratches and rust of its paint, 0 to 1.
+        seed: Of its pattern.
+
+    Raises:
+        ConfigError: A value is outside its range.
+    """
+
+    metallic: float = 0.0
+    dirt: float = 0.0
+    wear: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= amount <= 1.0 for amount in (self.metallic, self.dirt, self.wear)):
+            raise ConfigError(
+                f"a finish of {self.metallic} (metallic), {self.dirt} (dirt), {self.wear} (wear): give 0 to 1"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class SceneObject:
     """Body in a view.
 
@@ -131,6 +158,7 @@ class SceneObject:
         is_hidden: Whether it is invisible; it still casts its shadow.
         signals: `LampSignal` bits of its stop lamps and indicators that shine.
         effect: Name of the effect of the rendering without which it is not drawn; "": always.
+        finish: Metallic paint, dirt and wear; None for a clean body. What wears textures stays clean.
     """
 
     mesh: int
@@ -142,6 +170,7 @@ class SceneObject:
     is_hidden: bool = False
     signals: int = 0
     effect: str = ""
+    finish: Finish | None = None
 
 
 class LampSignal(IntFlag):
@@ -338,6 +367,10 @@ class RenderScene:
         They are infinite where the mesh has indicators of its own, or lamps that are not at its sides.
         """
         return self.compute_once(("lamp split", mesh), lambda: _lamp_split(self.meshes[mesh]))  # type: ignore[no-any-return]
+
+    def extent(self, mesh: int) -> tuple[F64, F64]:
+        """Return the smallest and the largest corner of a mesh in its own frame, m, [3] each."""
+        return self.compute_once(("extent", mesh), self.meshes[mesh].bounds)  # type: ignore[no-any-return]
 
     def ground_cover(self, mesh: int) -> tuple[F64, F64, float, float]:
         """Return the ground that a mesh covers.
