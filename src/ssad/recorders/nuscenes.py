@@ -34,12 +34,14 @@ from ssad.recorders.drives import check_streets, drive_street, make_drive
 from ssad.recorders.parts import TIME_LIMIT, PartsFolder
 from ssad.recorders.randomisation import NO_RANDOMISATION, CameraDraw, Randomisation, describe_bodies
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.sensor import SENSOR
+from ssad.rendering.camera.street_lighting import UNLIT
 from ssad.rendering.lidar import HDL32E, points_in_boxes, sweep
 from ssad.rendering.scene_objects import PlacedObject, SceneObjects, place_objects
 from ssad.rendering.signal_heads import SignalHeads, head_meshes
@@ -65,6 +67,7 @@ AHEAD: Final = {
 FIRST_SWEEP_END: Final = 0.1  # s, when the first sweep ends
 DRIVES_PER_STREET: Final = 4  # drives along one street where each street is built for the recording
 RANDOMISED: Final = "randomisation.json"  # in the folder of the tables: ranges, and what was drawn for each scene
+LIGHTING_SHARES: Final = {"M3": 0.15, "M4": 0.25, "M5": 0.15, "P2": 0.1, "P4": 0.15, "P5": 0.1, UNLIT: 0.1}  # of nights
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
@@ -144,9 +147,21 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
         "low": SceneWeather(float(rng.uniform(0.1, 0.3)), heading, float(rng.uniform(0.0, 0.5)), turn=turn),
         "fog": SceneWeather(sun_height, heading, 0.9, fog=float(rng.uniform(0.006, 0.025)), turn=turn),
         "wet": SceneWeather(sun_height, heading, 0.95, wet=float(rng.uniform(0.4, 1.0)), turn=turn),
-        "night": SceneWeather(float(rng.uniform(-0.3, -0.05)), heading, float(rng.uniform(0, 0.9)), turn=turn),
+        "night": SceneWeather(
+            float(rng.uniform(-0.3, -0.05)),
+            heading,
+            float(rng.uniform(0, 0.9)),
+            turn=turn,
+            lighting=draw_lighting(generator("record lighting", *key)),
+        ),
     }
     return by_kind[kind or str(drawn_kind)]
+
+
+def draw_lighting(draws: np.random.Generator) -> str:
+    """Draw the class of the street lighting of a night, if the effect `street-lighting` is on; else ""."""
+    lighting = str(draws.choice(list(LIGHTING_SHARES), p=list(LIGHTING_SHARES.values())))
+    return lighting if "street-lighting" in DEFAULT_EFFECTS else ""
 
 
 def describe_weather(weather: SceneWeather) -> str:
@@ -158,6 +173,8 @@ def describe_weather(weather: SceneWeather) -> str:
     ]
     if weather.fog:
         phrases.append(f"fog of {weather.fog:.3f}/m")
+    if weather.lighting:
+        phrases.append(f"street lighting {weather.lighting}")
     if weather.wet:
         phrases.append(f"wet road {weather.wet:.0%}")
     return ", ".join(phrases).replace("%", " %")

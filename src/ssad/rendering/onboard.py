@@ -24,8 +24,9 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest
 from ssad.core.types import F32, F64, I32, U8, End, EpisodeTrace
 from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
+from ssad.rendering.camera.render import Rendering, RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit, render_with
@@ -110,6 +111,7 @@ class Onboard:
         device: Device that renders: cpu or cuda:0.
         attack: Edit of one of the agents, or of stop signs, that cameras and LiDARs see.
         resident: Whether images stay on a GPU, as torch tensors, for a driver that processes them there.
+        effects: Effects of the rendering that cameras show, see `ssad.rendering.camera.effects`.
     """
 
     def __init__(
@@ -120,7 +122,9 @@ class Onboard:
         device: str = "cpu",
         attack: AgentEdit | None = None,
         resident: bool = False,
+        effects: frozenset[str] = DEFAULT_EFFECTS,
     ) -> None:
+        self.quality = RenderQuality(effects=effects)
         self.resident = resident and device != "cpu"
         self.at_once = AT_ONCE
         if device != "cpu":
@@ -230,8 +234,8 @@ class Onboard:
         views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
         edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
-            return render(scene, views, download=False)
-        rendering = render_with(scene, views, edit.textures, edit.masks)
+            return render(scene, views, quality=self.quality, download=False)
+        rendering = render_with(scene, views, edit.textures, edit.masks, quality=self.quality)
         image, tag, depth = (
             wp.array(array, device=self.device) for array in (rendering.image, rendering.tag, rendering.depth)
         )

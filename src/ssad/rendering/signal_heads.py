@@ -32,7 +32,7 @@ SIGNALS_WITHIN: Final = 150.0  # m from the eye
 
 WALK, STOP, DARK = "walk", "stop", "dark"  # states of the signals for walkers
 WALKER_LENSES: Final = {STOP: (2.32, SignalState.RED), WALK: (2.08, SignalState.GREEN)}  # height, m, and colour
-UNLIT_LENS: Final = {SignalState.RED: (0.30, 0.02, 0.015), SignalState.GREEN: (0.01, 0.22, 0.10)}
+UNLIT_LENS: Final = {SignalState.RED: (0.09, 0.007, 0.005), SignalState.GREEN: (0.004, 0.066, 0.03)}
 WALKER_LENS: Final = 0.09  # m, radius
 BESIDE, BEYOND = 0.4, 0.6  # m from the edge of a crossing, and from the kerb, to the post of its signal
 

@@ -51,7 +51,7 @@ from ssad.rendering.camera.sensor import (
     noise_levels,
     point_spread,
 )
-from ssad.rendering.camera.street_lighting import UNLIT, UNLIT_LUX, check_lighting
+from ssad.rendering.camera.street_lighting import UNLIT, UNLIT_LUX, USUAL_CLASS, check_lighting
 
 NEAR = 0.15  # m
 FAR = 500.0
@@ -73,8 +73,8 @@ class SceneWeather:
         wet: Wetness of the ground, 0 to 1.
         exposure: Stops relative to the exposure that suits the light.
         turn: Offset of the clouds.
-        lighting: Class of the street lighting at night (see `ssad.rendering.camera.street_lighting`); "": lamps that
-            meet no class, with 3.5 lux on average.
+        lighting: Class of the street lighting at night (see `ssad.rendering.camera.street_lighting`); "": with the
+            effect `street-lighting` the usual class, without it lamps that meet none.
 
     Raises:
         UnknownNameError: There is no such class.
@@ -470,7 +470,9 @@ def render(
 
 
 def _with_effects(view: View, effects: frozenset[str]) -> View:
-    """Return the view without the objects of effects that are off, and with the pattern of head lamps if it is on."""
+    """Return the view without the objects of effects that are off, and with the lamps of those that are on."""
+    if "street-lighting" in effects and not view.weather.lighting:
+        view = replace(view, weather=replace(view.weather, lighting=USUAL_CLASS))
     if "low-beams" in effects and view.lamps:
         view = replace(view, lamps=with_low_beams(view.lamps))
     if all(not entry.effect or entry.effect in effects for entry in view.objects):

@@ -25,6 +25,7 @@ LUMINANCE_COEFFICIENT: Final = 0.07  # cd/m^2 for 1 lux, asphalt of class R3
 LUMINANCE: Final = {"M1": 2.0, "M2": 1.5, "M3": 1.0, "M4": 0.75, "M5": 0.5, "M6": 0.3}
 ILLUMINANCE: Final = {"P1": 15.0, "P2": 10.0, "P3": 7.5, "P4": 5.0, "P5": 3.0, "P6": 2.0}
 LIGHTING_CLASSES: Final = (*LUMINANCE, *ILLUMINANCE, UNLIT)
+USUAL_CLASS: Final = "M4"  # of main streets in towns
 
 SPREAD: Final = (2.0, 3.8)  # tangents of the half angles across and along the road
 SOFT: Final = 0.9

@@ -26,9 +26,10 @@ INDICATOR = wp.constant(3)
 BRAKE_LAMP = wp.constant(4)
 STREET_LAMP = wp.constant(5)
 
-# Emission of lit signals of vehicles: red stop lamps and amber indicators (see `ssad.rendering.camera.lamps`).
-BRAKE_LIGHT = wp.constant(wp.vec3(2.3, 0.03, 0.02))
-TURN_LIGHT = wp.constant(wp.vec3(1.6, 0.45, 0.0))
+# Emission of lit signals of vehicles. On the scale of noon their luminance is about 12,000 cd/m^2: that of stop lamps
+# of 100 cd (UN Regulation No. 7) and indicators of 200 cd (No. 6) with lenses of 0.8 and 1.7 dm^2.
+BRAKE_LIGHT = wp.constant(wp.vec3(4.0, 0.08, 0.05))
+TURN_LIGHT = wp.constant(wp.vec3(2.4, 0.65, 0.0))
 
 # Shapes of the light of a lamp.
 ELLIPSE = wp.constant(0)
