@@ -10,6 +10,7 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, EpisodeTrace, SignalState
+from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.camera.scene import SceneObject
@@ -22,12 +23,11 @@ from ssad.world.roads.sidewalks import sidewalk_network
 LENS: Final = 0.11  # m, radius of a signal's lens
 LENSES: Final = {SignalState.RED: 0.31, SignalState.YELLOW: 0.0, SignalState.GREEN: -0.31}  # m above a head's middle
 LENS_CANDELA: Final = 400.0  # luminous intensity of a lit lens (EN 12368, performance level 3)
-LIGHTS: Final = {  # linear RGB
+LIGHTS: Final = {  # linear RGB; amber is that of 592 nm, as near as sRGB comes
     SignalState.RED: (1.0, 0.004, 0.002),
-    SignalState.YELLOW: (1.0, 0.22, 0.0),
+    SignalState.YELLOW: (1.0, 0.25, 0.0),
     SignalState.GREEN: (0.003, 1.0, 0.12),
 }
-TO_LUMINANCE: Final = (0.2126, 0.7152, 0.0722)
 SIGNALS_WITHIN: Final = 150.0  # m from the eye
 
 WALK, STOP, DARK = "walk", "stop", "dark"  # states of the signals for walkers

@@ -25,6 +25,7 @@ from ssad.rendering.camera.lamps import (
     LAMP_NEAR,
     LAMP_SHADOWS,
     NIGHT_LUX,
+    TO_LUMINANCE,
     SceneLamp,
     lamp_lens,
     lamp_strength,
@@ -219,7 +220,7 @@ def scene_light(weather: SceneWeather) -> tuple[tuple[Any, ...], float]:
     night_zenith, night_horizon = 0.010, 0.016
     if weather.lighting == UNLIT:
         # The same weights of zenith and horizon as in the shading of level ground.
-        level = 0.65 * night_zenith * zenith_colour.mean() + 0.35 * night_horizon * horizon_colour.mean()
+        level = (0.65 * night_zenith * zenith_colour + 0.35 * night_horizon * horizon_colour) @ TO_LUMINANCE
         night_zenith, night_horizon = (night * UNLIT_LUX * NIGHT_LUX / level for night in (night_zenith, night_horizon))
     zenith = zenith_colour * (night_zenith + 0.9 * daylight)
     horizon_glow = np.array([1.0, 0.55, 0.30]) * (1 - warmth) * 0.5 * daylight
