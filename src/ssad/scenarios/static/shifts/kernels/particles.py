@@ -73,7 +73,10 @@ def blur_coarsely(
     width: int,
     out: wp.array3d(dtype=wp.vec3),
 ):
-    """Compute the mean light (1 for white) of squares of BLOCK pixels, from every second pixel of every second row."""
+    """Compute the mean light (1 for white) of squares of BLOCK pixels, from every second pixel of every second row.
+
+    They are those of a quincunx, which meets both fields of a fine chequered pattern.
+    """
     b, row = wp.tid()
     for column in range(out.shape[2]):
         total = wp.vec3(0.0, 0.0, 0.0)
@@ -82,7 +85,7 @@ def blur_coarsely(
             y = row * BLOCK + dy
             if y < height:
                 for dx in range(0, BLOCK, 2):
-                    x = column * BLOCK + dx
+                    x = column * BLOCK + dx + (dy / 2) % 2
                     if x < width:
                         pixel = ((b * height + y) * width + x) * 3
                         total += wp.vec3(
