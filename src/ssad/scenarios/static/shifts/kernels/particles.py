@@ -100,17 +100,17 @@ def blur_coarsely(
 @wp.func
 def coarse_light(coarse: wp.array3d(dtype=wp.vec3), b: int, y: float, x: float) -> wp.vec3:
     """Return the light at a place of the image, px, between four squares, clamped at the border."""
-    v = wp.clamp(y / float(BLOCK) - 0.5, 0.0, float(coarse.shape[1] - 1))
-    u = wp.clamp(x / float(BLOCK) - 0.5, 0.0, float(coarse.shape[2] - 1))
-    row = wp.min(int(v), wp.max(coarse.shape[1] - 2, 0))
-    column = wp.min(int(u), wp.max(coarse.shape[2] - 2, 0))
+    grid_y = wp.clamp(y / float(BLOCK) - 0.5, 0.0, float(coarse.shape[1] - 1))
+    grid_x = wp.clamp(x / float(BLOCK) - 0.5, 0.0, float(coarse.shape[2] - 1))
+    row = wp.min(int(grid_y), wp.max(coarse.shape[1] - 2, 0))
+    column = wp.min(int(grid_x), wp.max(coarse.shape[2] - 2, 0))
     next_row = wp.min(row + 1, coarse.shape[1] - 1)
     next_column = wp.min(column + 1, coarse.shape[2] - 1)
-    t = v - float(row)
-    s = u - float(column)
-    upper = coarse[b, row, column] * (1.0 - s) + coarse[b, row, next_column] * s
-    lower = coarse[b, next_row, column] * (1.0 - s) + coarse[b, next_row, next_column] * s
-    return upper * (1.0 - t) + lower * t
+    lower_share = grid_y - float(row)
+    right_share = grid_x - float(column)
+    upper = coarse[b, row, column] * (1.0 - right_share) + coarse[b, row, next_column] * right_share
+    lower = coarse[b, next_row, column] * (1.0 - right_share) + coarse[b, next_row, next_column] * right_share
+    return upper * (1.0 - lower_share) + lower * lower_share
 
 
 @wp.kernel
@@ -135,31 +135,31 @@ def refract(
     image_start = b * height * width * 3
     for drop_index in range(first[b], first[b + 1]):
         drop = drops[drop_index]
-        v = (float(y) - drop.y) / (drop.radius * drop.oval)
-        if wp.abs(v) < 1.25:
+        share_y = (float(y) - drop.y) / (drop.radius * drop.oval)
+        if wp.abs(share_y) < 1.25:
             half_width = int(1.25 * drop.radius) + 1
             for column_offset in range(-half_width, half_width + 1):
                 x = int(drop.x) + column_offset
-                u = (float(x) - drop.x) / drop.radius
-                angle = wp.atan2(v, u)
+                share_x = (float(x) - drop.x) / drop.radius
+                angle = wp.atan2(share_y, share_x)
                 uneven = (
                     1.0 + 0.12 * wp.cos(2.0 * angle + drop.oval_phase) + 0.06 * wp.cos(3.0 * angle + drop.bump_phase)
                 )
-                radius_share = wp.sqrt(u * u + v * v) / uneven
+                radius_share = wp.sqrt(share_x * share_x + share_y * share_y) / uneven
                 if radius_share < 1.0 and x >= 0 and x < width:
                     # A wide view that bulges: its rim looks farther aside than its middle, past the image border.
                     bulge = (0.35 + 0.2 * radius_share * radius_share) * float(height)
                     light = wp.vec3(0.0, 0.0, 0.0)
                     for tap_index in range(9):
-                        dx = float(tap_index % 3 - 1)
-                        dy = float(tap_index / 3 - 1)
+                        tap_x = float(tap_index % 3 - 1)
+                        tap_y = float(tap_index / 3 - 1)
                         # Binomial weights over 3 x 3 places, as far apart as the squares are.
-                        weight = (2.0 - wp.abs(dx)) * (2.0 - wp.abs(dy)) / 16.0
+                        weight = (2.0 - wp.abs(tap_x)) * (2.0 - wp.abs(tap_y)) / 16.0
                         light += weight * coarse_light(
                             coarse,
                             b,
-                            drop.y - v * bulge + dy * float(BLOCK),
-                            drop.x - u * bulge + dx * float(BLOCK),
+                            drop.y - share_y * bulge + tap_y * float(BLOCK),
+                            drop.x - share_x * bulge + tap_x * float(BLOCK),
                         )
                     edge = wp.clamp((1.0 - radius_share) / SOFT_EDGE, 0.0, 1.0)
                     opacity = 0.85 * edge * edge * (3.0 - 2.0 * edge)
