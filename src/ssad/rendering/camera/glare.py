@@ -212,12 +212,13 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
     height, width = radiance.shape[1:]
     rows: Any = []
     side = 0
-    for view, (fx, fy, cx, cy), light in zip(views, lens, lights, strict=True):
-        x, y, z = view.pose[:3, :3].T @ np.asarray(light[0])
+    for view, (focal_x, focal_y, centre_x, centre_y), light in zip(views, lens, lights, strict=True):
+        right, down, ahead = view.pose[:3, :3].T @ np.asarray(light[0])
         strength = np.asarray(light[1]) * (1.0 - 0.9 * light[6])
-        radius = SUN_RADIUS * math.sqrt(fx * fy)
-        column, row = fx * x / max(z, 1e-9) + cx, fy * y / max(z, 1e-9) + cy
-        is_visible = view.sensor.scatters and z > 0.0 and strength.max() > 0.0
+        radius = SUN_RADIUS * math.sqrt(focal_x * focal_y)
+        column = focal_x * right / max(ahead, 1e-9) + centre_x
+        row = focal_y * down / max(ahead, 1e-9) + centre_y
+        is_visible = view.sensor.scatters and ahead > 0.0 and strength.max() > 0.0
         is_visible &= -radius < column < width + radius and -radius < row < height + radius
         # The disc sends the irradiance of the sun; it is pi times the colour, and spread over the disc's solid angle.
         disc = strength / math.sin(SUN_RADIUS) ** 2 if is_visible else np.zeros(3)

@@ -37,62 +37,64 @@ class Finish:
 
 
 @wp.func
-def lattice(x: int, y: int, z: int, seed: int) -> float:
+def lattice(column: int, row: int, layer: int, seed: int) -> float:
     """Return a fixed random number in [0, 1) for a cell in space."""
-    return speck(x + 131 * z + 7919 * seed, y + 57 * z - 3571 * seed)
+    return speck(column + 131 * layer + 7919 * seed, row + 57 * layer - 3571 * seed)
 
 
 @wp.func
-def noise(p: wp.vec3, seed: int) -> float:
+def eased(share: float) -> float:
+    """Return the Hermite step of a share."""
+    return share * share * (3.0 - 2.0 * share)
+
+
+@wp.func
+def noise(point: wp.vec3, seed: int) -> float:
     """Return smooth noise in [0, 1] with unit cells in space."""
-    i = wp.floor(p[0])
-    j = wp.floor(p[1])
-    k = wp.floor(p[2])
-    u = p[0] - i
-    v = p[1] - j
-    w = p[2] - k
-    u = u * u * (3.0 - 2.0 * u)
-    v = v * v * (3.0 - 2.0 * v)
-    w = w * w * (3.0 - 2.0 * w)
-    x = int(i)
-    y = int(j)
-    z = int(k)
+    column = wp.floor(point[0])
+    row = wp.floor(point[1])
+    layer = wp.floor(point[2])
+    column_share = eased(point[0] - column)
+    row_share = eased(point[1] - row)
+    layer_share = eased(point[2] - layer)
     total = float(0.0)
     for corner in range(8):
-        dx = corner % 2
-        dy = (corner / 2) % 2
-        dz = corner / 4
-        weight = wp.where(dx == 1, u, 1.0 - u) * wp.where(dy == 1, v, 1.0 - v) * wp.where(dz == 1, w, 1.0 - w)
-        total += weight * lattice(x + dx, y + dy, z + dz, seed)
+        column_offset = corner % 2
+        row_offset = (corner / 2) % 2
+        layer_offset = corner / 4
+        weight = wp.where(column_offset == 1, column_share, 1.0 - column_share)
+        weight *= wp.where(row_offset == 1, row_share, 1.0 - row_share)
+        weight *= wp.where(layer_offset == 1, layer_share, 1.0 - layer_share)
+        total += weight * lattice(int(column) + column_offset, int(row) + row_offset, int(layer) + layer_offset, seed)
     return total
 
 
 @wp.func
-def dirt_share(finish: Finish, p: wp.vec3, n: wp.vec3) -> float:
+def dirt_share(finish: Finish, point: wp.vec3, normal: wp.vec3) -> float:
     """Return the share of a surface that dirt covers, at a point with a normal, both in the object's frame.
 
     Wheels throw dirt at the lower sides, the wake draws it to the rear, and dust settles on what is level.
     """
-    splash = wp.clamp(1.1 - 2.0 * p[2] / finish.height, 0.0, 1.0)
-    rear = 0.35 * wp.max(-n[0], 0.0)
-    settled = 0.25 * wp.max(n[2], 0.0)
-    patches = 0.5 * noise(p * 1.7, finish.seed) + 0.3 * noise(p * 6.0, finish.seed + 1)
+    splash = wp.clamp(1.1 - 2.0 * point[2] / finish.height, 0.0, 1.0)
+    rear = 0.35 * wp.max(-normal[0], 0.0)
+    settled = 0.25 * wp.max(normal[2], 0.0)
+    patches = 0.5 * noise(point * 1.7, finish.seed) + 0.3 * noise(point * 6.0, finish.seed + 1)
     # Rain washes dirt down in streaks.
-    streaks = 0.2 * noise(wp.vec3(p[0] * 22.0, p[1] * 22.0, p[2] * 1.5), finish.seed + 2)
+    streaks = 0.2 * noise(wp.vec3(point[0] * 22.0, point[1] * 22.0, point[2] * 1.5), finish.seed + 2)
     return wp.min(finish.dirt * (0.15 + splash + rear + settled) * (0.3 + 1.2 * (patches + streaks)), 0.92)
 
 
 @wp.func
-def worn(finish: Finish, albedo: wp.vec3, p: wp.vec3) -> wp.vec3:
+def worn(finish: Finish, albedo: wp.vec3, point: wp.vec3) -> wp.vec3:
     """Return the albedo of worn paint: chalked, scratched, with rust on its lower parts."""
     grey = 0.3333 * (albedo[0] + albedo[1] + albedo[2])
-    chalk = 0.3 * finish.wear * (0.5 + noise(p * 2.3, finish.seed + 3))
+    chalk = 0.3 * finish.wear * (0.5 + noise(point * 2.3, finish.seed + 3))
     pale = wp.vec3(grey, grey, grey) * 0.9 + wp.vec3(0.05, 0.05, 0.05)
     result = albedo * (1.0 - chalk) + pale * chalk
-    scratch = noise(wp.vec3(p[0] * 2.0, p[1] * 40.0, p[2] * 55.0), finish.seed + 4)
+    scratch = noise(wp.vec3(point[0] * 2.0, point[1] * 40.0, point[2] * 55.0), finish.seed + 4)
     scratch_share = wp.clamp((scratch - 0.82) * 8.0, 0.0, 1.0) * 0.6 * finish.wear
     result = result * (1.0 - scratch_share) + wp.vec3(0.3, 0.3, 0.3) * scratch_share
-    rust = noise(p * 9.0, finish.seed + 5) + 0.25 * wp.clamp(1.0 - 2.0 * p[2] / finish.height, 0.0, 1.0)
+    rust = noise(point * 9.0, finish.seed + 5) + 0.25 * wp.clamp(1.0 - 2.0 * point[2] / finish.height, 0.0, 1.0)
     rust_share = wp.clamp((rust - 1.15 + 0.25 * finish.wear) * 8.0, 0.0, 1.0) * finish.wear
     return result * (1.0 - rust_share) + RUST * rust_share
 
@@ -131,24 +133,26 @@ def apply_finish(
         if row >= 0 and finishes[row].tag == object_tag:
             finish = finishes[row]
             ray = wp.vec3((float(x) - focal[2]) / focal[0], (float(y) - focal[3]) / focal[1], 1.0)
-            p = wp.transform_point(finish.to_object, ray * depth[view, y, x])
+            point = wp.transform_point(finish.to_object, ray * depth[view, y, x])
             # The normal is in the world frame; the matrix leads from the camera.
-            n = wp.transform_vector(finish.to_object, wp.transpose(rotation_of(to_world[view])) * normal[view, y, x])
-            own = albedo[view, y, x]
-            changed = own
+            local_normal = wp.transform_vector(
+                finish.to_object, wp.transpose(rotation_of(to_world[view])) * normal[view, y, x]
+            )
+            clean = albedo[view, y, x]
+            changed = clean
             is_paint = surfaces[material[view, y, x]].paint
             if is_paint == 1:
                 if finish.metallic > 0.0:
-                    facing = wp.abs(wp.dot(n, wp.normalize(finish.eye - p)))
+                    facing = wp.abs(wp.dot(local_normal, wp.normalize(finish.eye - point)))
                     # The mean of the factor over the hemisphere, weighted by its cosine, is 1.
                     changed = changed * (1.0 + finish.metallic * (0.9 * facing * facing - 0.45))
                 if finish.wear > 0.0:
-                    changed = worn(finish, changed, p)
+                    changed = worn(finish, changed, point)
             if finish.dirt > 0.0:
-                share = dirt_share(finish, p, n)
+                share = dirt_share(finish, point, local_normal)
                 if is_paint == 0:
                     # Glass, lamps and tyres are wiped or rub themselves clean.
                     share = 0.35 * share
                 changed = changed * (1.0 - share) + DUST * share
-            lit = radiance[view, y, x] + wp.cw_mul(gain[view, y, x], changed - own)
+            lit = radiance[view, y, x] + wp.cw_mul(gain[view, y, x], changed - clean)
             radiance[view, y, x] = wp.max(lit, wp.vec3(0.0, 0.0, 0.0))

@@ -28,20 +28,26 @@ def shrink(
     out: wp.array3d(dtype=wp.vec3),
 ):
     """Halve images. Weights [size, 4] are those of the rows 2 i - 1 to 2 i + 2, 0 outside of the image."""
-    view, i = wp.tid()
+    view, half_row = wp.tid()
     height = image.shape[1]
     width = image.shape[2]
-    for j in range(out.shape[2]):
+    for half_column in range(out.shape[2]):
         total = wp.vec3(0.0, 0.0, 0.0)
-        left = wp.max(2 * j - 1, 0)
-        right = wp.min(2 * j + 2, width - 1)
-        middle = wp.min(2 * j + 1, width - 1)
+        left = wp.max(2 * half_column - 1, 0)
+        right = wp.min(2 * half_column + 2, width - 1)
+        middle = wp.min(2 * half_column + 1, width - 1)
         for tap in range(4):
-            y = wp.clamp(2 * i - 1 + tap, 0, height - 1)
-            row = image[view, y, left] * column_weights[j, 0] + image[view, y, 2 * j] * column_weights[j, 1]
-            row += image[view, y, middle] * column_weights[j, 2] + image[view, y, right] * column_weights[j, 3]
-            total += row * row_weights[i, tap]
-        out[view, i, j] = total
+            y = wp.clamp(2 * half_row - 1 + tap, 0, height - 1)
+            row = (
+                image[view, y, left] * column_weights[half_column, 0]
+                + image[view, y, 2 * half_column] * column_weights[half_column, 1]
+            )
+            row += (
+                image[view, y, middle] * column_weights[half_column, 2]
+                + image[view, y, right] * column_weights[half_column, 3]
+            )
+            total += row * row_weights[half_row, tap]
+        out[view, half_row, half_column] = total
 
 
 @wp.func
@@ -103,15 +109,17 @@ def add_ghosts(
         for index in range(GHOSTS):
             ghost = ghosts[view, index]
             if ghost.light[1] > 0.0:
-                u = (((float(x) + 0.5) * scale - centre[0]) / ghost.size + centre[0]) / source_scale - 0.5
-                v = (((float(y) + 0.5) * scale - centre[1]) / ghost.size + centre[1]) / source_scale - 0.5
-                column = int(wp.floor(u))
-                row = int(wp.floor(v))
-                s = u - float(column)
-                t = v - float(row)
-                upper = texel(source, view, row, column) * (1.0 - s) + texel(source, view, row, column + 1) * s
-                lower = texel(source, view, row + 1, column) * (1.0 - s) + texel(source, view, row + 1, column + 1) * s
-                total += wp.cw_mul(upper * (1.0 - t) + lower * t, ghost.light)
+                source_x = (((float(x) + 0.5) * scale - centre[0]) / ghost.size + centre[0]) / source_scale - 0.5
+                source_y = (((float(y) + 0.5) * scale - centre[1]) / ghost.size + centre[1]) / source_scale - 0.5
+                column = int(wp.floor(source_x))
+                row = int(wp.floor(source_y))
+                right_share = source_x - float(column)
+                lower_share = source_y - float(row)
+                upper = texel(source, view, row, column) * (1.0 - right_share)
+                upper += texel(source, view, row, column + 1) * right_share
+                lower = texel(source, view, row + 1, column) * (1.0 - right_share)
+                lower += texel(source, view, row + 1, column + 1) * right_share
+                total += wp.cw_mul(upper * (1.0 - lower_share) + lower * lower_share, ghost.light)
         out[view, y, x] = total
 
 
@@ -159,17 +167,19 @@ def add_sun(discs: wp.array(dtype=SunDisc), tag: wp.array3d(dtype=int), side: in
     disc = discs[view]
     if disc.light[0] <= 0.0:
         return
-    y = int(wp.floor(disc.y)) - side / 2 + row
-    x = int(wp.floor(disc.x)) - side / 2 + column
-    if y < 0 or x < 0 or y >= radiance.shape[1] or x >= radiance.shape[2]:
+    image_row = int(wp.floor(disc.y)) - side / 2 + row
+    image_column = int(wp.floor(disc.x)) - side / 2 + column
+    if image_row < 0 or image_column < 0 or image_row >= radiance.shape[1] or image_column >= radiance.shape[2]:
         return
-    if tag[view, y, x] >= 0:
+    if tag[view, image_row, image_column] >= 0:
         return
     inside = int(0)
     for sample in range(16):
-        dx = float(x) + (float(sample % 4) - 1.5) * 0.25 - disc.x
-        dy = float(y) + (float(sample / 4) - 1.5) * 0.25 - disc.y
+        dx = float(image_column) + (float(sample % 4) - 1.5) * 0.25 - disc.x
+        dy = float(image_row) + (float(sample / 4) - 1.5) * 0.25 - disc.y
         if dx * dx + dy * dy < disc.radius * disc.radius:
             inside += 1
     if inside > 0:
-        radiance[view, y, x] = radiance[view, y, x] + disc.light * (float(inside) / 16.0)
+        radiance[view, image_row, image_column] = radiance[view, image_row, image_column] + disc.light * (
+            float(inside) / 16.0
+        )

@@ -71,17 +71,17 @@ def put(
     curves: wp.array2d(dtype=wp.uint8),
 ):
     """Write the codes of a pixel by a row of the curves."""
-    r = red
-    g = green
-    b = blue
+    final_red = red
+    final_green = green
+    final_blue = blue
     if saturation != 1.0:
         grey = 0.2126 * red + 0.7152 * green + 0.0722 * blue
-        r = saturated(red, grey, saturation)
-        g = saturated(green, grey, saturation)
-        b = saturated(blue, grey, saturation)
-    out[view, y, x, 0] = code_of(curves, row, r)
-    out[view, y, x, 1] = code_of(curves, row, g)
-    out[view, y, x, 2] = code_of(curves, row, b)
+        final_red = saturated(red, grey, saturation)
+        final_green = saturated(green, grey, saturation)
+        final_blue = saturated(blue, grey, saturation)
+    out[view, y, x, 0] = code_of(curves, row, final_red)
+    out[view, y, x, 1] = code_of(curves, row, final_green)
+    out[view, y, x, 2] = code_of(curves, row, final_blue)
 
 
 @wp.func
