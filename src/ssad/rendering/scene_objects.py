@@ -15,13 +15,14 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
+from ssad.core.types import F64, U8, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, TowingVehicle, plain_body, towing_vehicle
-from ssad.rendering.camera.scene import SceneObject
+from ssad.rendering.camera.scene import Finish, SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
+from ssad.rendering.vehicle_signals import flashing, trace_signals
 from ssad.world.models import SURROGATES, stated_size, trace_sizes
 
 Size = tuple[float, float, float]  # length, width, height
@@ -101,6 +102,8 @@ class ObjectBody:
         active: [T] whether it is present.
         is_driven: [T] distance covered so far, m.
         is_parked: Whether it is a vehicle without a driver.
+        signals: [T] `LampSignal` bits of its stop lamps and indicators, or [1] if they never shine.
+        finish: Metallic paint, dirt and wear; None for a clean body.
     """
 
     tag: int
@@ -113,6 +116,8 @@ class ObjectBody:
     active: Bool
     is_driven: F64
     is_parked: bool = False
+    signals: U8 = field(default_factory=lambda: np.zeros(1, np.uint8))
+    finish: Finish | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,11 +219,17 @@ class SceneObjects:
             )
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            placed.append(
-                PlacedObject(
-                    body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked)
-                )
+            signals = int(flashing(body.signals[min(lower_step, len(body.signals) - 1)], time, body.tag))
+            scene_object = SceneObject(
+                mesh,
+                pose,
+                body.paint,
+                body.tag,
+                is_lit=not body.is_parked,
+                signals=signals,
+                finish=body.finish,
             )
+            placed.append(PlacedObject(body, pose, speed, scene_object))
         return placed
 
     def add(
@@ -228,6 +239,7 @@ class SceneObjects:
         *,
         active: Bool | None = None,
         parked: bool = False,
+        signals: U8 | None = None,
     ) -> None:
         """Add a body (kind, style, size, meshes) with its track; its paint is drawn."""
         tag = len(self.bodies) + 1
@@ -239,7 +251,8 @@ class SceneObjects:
         activity = np.ones(len(track), bool) if active is None else active
         paint = draw_paint(generator("paint", *self.key, tag))
         kind, style, size, meshes = body_parts
-        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked))
+        shown = np.zeros(1, np.uint8) if signals is None else signals
+        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked, shown))
 
     def make(
         self,
@@ -355,6 +368,7 @@ def place_objects(
 def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
     """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
     sizes = trace_sizes(trace)
+    signals = trace_signals(trace)
     for agent in range(1, len(trace.models)):
         rng = generator("record body", *population.key, agent)
         track = np.stack([trace.x[:, agent], trace.y[:, agent], trace.yaw[:, agent], 0 * trace.x[:, agent]], -1).astype(
@@ -371,7 +385,7 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         kind, styles = ACTOR_BODIES[trace.models[agent]]
         style = styles[int(rng.integers(len(styles)))]
         if kind == "bus" and rng.random() < 0.45 and not is_exact:
-            _add_tractor(population, track, active, rng)
+            _add_tractor(population, track, active, signals[:, agent], rng)
             continue
         if kind == "truck" and rng.random() < 0.3:
             kind, style = "construction", draw_style("construction", generator=rng)
@@ -381,10 +395,14 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         if is_exact:
             size = model_size
         phases = PHASES if kind in ("pedestrian", "bicycle") else 1
-        population.add(population.make(kind, style, size, phases=phases), track, active=active)
+        population.add(
+            population.make(kind, style, size, phases=phases), track, active=active, signals=signals[:, agent]
+        )
 
 
-def _add_tractor(population: SceneObjects, track: F64, active: Bool, random_draws: np.random.Generator) -> None:
+def _add_tractor(
+    population: SceneObjects, track: F64, active: Bool, signals: U8, random_draws: np.random.Generator
+) -> None:
     """A tractor on the front half of the agent, a trailer that follows its hitch."""
     height = float(random_draws.uniform(3.2, 3.8))
     sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(random_draws.uniform(3.3, 3.9))))
@@ -404,8 +422,8 @@ def _add_tractor(population: SceneObjects, track: F64, active: Bool, random_draw
             trailer_yaw,
         )
     style = ("box", "tank", "flatbed")[int(random_draws.integers(3))]
-    population.add(population.make("truck", "tractor", sizes[0]), tractor_track, active=active)
-    population.add(population.make("trailer", style, sizes[1]), trailer_track, active=active)
+    population.add(population.make("truck", "tractor", sizes[0]), tractor_track, active=active, signals=signals)
+    population.add(population.make("trailer", style, sizes[1]), trailer_track, active=active, signals=signals)
 
 
 def _fixed_track(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
