@@ -76,6 +76,9 @@ def import_map(
             help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
         ),
     ] = None,
+    signals: Annotated[
+        bool, typer.Option("--signals", help="Add traffic lights to junctions where ways meet and the file has none.")
+    ] = False,
     origin: Annotated[
         str | None,
         typer.Option(
@@ -122,6 +125,7 @@ def import_map(
             report=report,
             strict=strict,
             turn_on_red=turn_on_red,
+            signals=signals,
             progress=status.update,
             lanelet2=lanelet2,
         )

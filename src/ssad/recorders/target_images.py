@@ -79,6 +79,7 @@ SECONDS: Final = 24.0  # of a drive
 TARGET: Final = 1_000_000  # its tag
 HIDDEN: Final = 0.25  # visible share below which an object is crowd, as one with a side below SMALL
 MIN_VISIBLE_SHARE: Final = 0.6  # least visible share of the target, and least share of it inside the picture
+STRAIGHT: Final = 0.95  # least distance of a target on an approach, as a share of the way to it
 MAX_NEAR_SHARE: Final = 0.2  # largest share of the picture that something right before the camera may cover
 
 
@@ -187,6 +188,9 @@ def _viewpoint_rounds(
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
     recording, key = stage_set.recording, stage_set.key
     rng = generator("clips shots", *key)
+    if recording.approach:
+        yield from _approaching_rounds(stage_set, town, slots, missing, rng)
+        return
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
         remaining = iter(
@@ -226,6 +230,40 @@ def _viewpoint_rounds(
         # Reversed, so that the first free proposal of each image wins.
         first_free = dict(reversed([pair for pair, is_free in zip(proposals, sight_free, strict=True) if is_free]))
         yield sorted(first_free.items())
+
+
+def _approaching_rounds(
+    stage_set: _TargetDrive, town: str, slots: range, missing: Callable[[], list[int]], rng: np.random.Generator
+) -> Iterator[list[tuple[int, Viewpoint]]]:
+    """Again and again shots for what is missing, each from its own distance, until this drive has no more."""
+    recording = stage_set.recording
+    weather = draw_weather(("clips", *stage_set.key))
+    distance_indices = shuffled_cells(slots, len(recording.approach), key=(recording.seed, town))
+    remaining: dict[int, Iterator[Viewpoint]] = {}
+    for index, distance in enumerate(recording.approach):
+        viewpoints = following_viewpoints(
+            stage_set.trace,
+            weather,
+            behind=distance,
+            height=recording.height,
+            count=distance_indices.count(index),
+            rng=rng,
+        )
+        straight = [viewpoint for viewpoint in viewpoints if viewpoint.description["distance"] >= STRAIGHT * distance]
+        sight_free = has_free_sight(stage_set.scene, straight, batch=batch_size(recording.device), height=2 * AIM)
+        free = [viewpoint for viewpoint, is_free in zip(straight, sight_free, strict=True) if is_free]
+        remaining[index] = iter(
+            [replace(viewpoint, description=viewpoint.description | {"distance": distance}) for viewpoint in free]
+        )
+    while True:
+        batch = []
+        for slot in missing():
+            viewpoint = next(remaining[distance_indices[slot]], None)
+            if viewpoint is not None:
+                batch.append((slot, viewpoint))
+        if not batch:
+            return
+        yield batch
 
 
 def _record_part(task: tuple[TargetRecording, str, int, int, str]) -> str:

@@ -7,7 +7,7 @@ The result does not depend on the other episodes that share a scene.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
@@ -88,6 +88,7 @@ class Appearance:
         strides: Phase of each agent's walking cycle at the start, m.
         signals: Lit signals of the town's lane graph: those of the junctions on the ego's route.
         signs: Numbers of the town's signs near the route.
+        route: Points of the ego's route [N, 2], m.
     """
 
     key: str
@@ -98,6 +99,7 @@ class Appearance:
     strides: F64
     signals: I32
     signs: tuple[int, ...]
+    route: F64 = field(default_factory=lambda: np.zeros((0, 2)))
 
     def bodies(self) -> set[BodyKey]:
         """Return the keys of the bodies that the agents need, in all phases of their cycles."""
@@ -158,10 +160,12 @@ class EpisodeScene:
             street_signs(graph, sign_positions, GroundOccupancy(street), key=(graph.name,), many=False, detail=1)
         )
         self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
+        self.sign_kinds = {index: sign.kind for index, sign in enumerate(signs)}
         self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
         # Signs and lenses come first: their numbers must not change when bodies are added.
         self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + [_lens(state) for state in LENSES]
         heads = street.heads.astype(np.float64)
+        self.heads = heads
         self._head_places = heads[:, :2]
         self._lenses = [
             {
@@ -192,6 +196,10 @@ class EpisodeScene:
             self._bodies |= {key: first_index + index for index, key in enumerate(meshes)}
             self._meshes |= meshes
             self._scene = None
+
+    def indices(self, keys: Iterable[object]) -> dict[object, int]:
+        """Return the number of each mesh in the scene."""
+        return {key: self._bodies[key] for key in keys}
 
     def index(self, key: object) -> int:
         """Return the number of a mesh in the scene."""
@@ -242,6 +250,7 @@ class EpisodeScene:
             strides,
             signals,
             tuple(near_signs),
+            way.astype(np.float64),
         )
 
     def objects(

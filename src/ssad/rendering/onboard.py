@@ -33,6 +33,7 @@ from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.sensor import SensorModel as Response
 from ssad.rendering.episode_scene import AgentPoses, Appearance, EpisodeScene, agent_poses, walked_distance
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
+from ssad.rendering.street_edit import StreetEdit
 from ssad.world.models import MODELS, agent_size
 
 DAY: Final = SceneWeather(0.9, 2.2, 0.3)
@@ -101,6 +102,10 @@ class Onboard:
         device: Device that renders: cpu or cuda:0.
         attack: Edit of one of the agents, or of stop signs, that cameras and LiDARs see.
         resident: Whether images stay on a GPU, as torch tensors, for a driver that processes them there.
+        street_edit: Edit of the street that cameras and LiDARs see; not together with `attack`.
+
+    Raises:
+        ConfigError: There are both an attack and an edit of the street.
     """
 
     def __init__(
@@ -111,6 +116,7 @@ class Onboard:
         device: str = "cpu",
         attack: AgentEdit | None = None,
         resident: bool = False,
+        street_edit: StreetEdit | None = None,
     ) -> None:
         self.resident = resident and device != "cpu"
         self.at_once = AT_ONCE
@@ -118,6 +124,9 @@ class Onboard:
             # other processes may share the device
             self.at_once = max(min(AT_ONCE_GPU, wp.get_device(device).free_memory // 4 // VIEW_MEMORY), AT_LEAST_GPU)
         self.weather, self.response, self.device, self.attack = weather, response, device, attack
+        if attack is not None and street_edit is not None:
+            raise ConfigError("an agent and the street are edited at once; use one attack at a time")
+        self.street_edit = street_edit
         self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
         self._simulator: Simulator | None = None
         self._tracks: dict[int, _Track] = {}
@@ -205,10 +214,15 @@ class Onboard:
         town.add_bodies(appearance.bodies())
         if self.attack is not None:
             town.add_meshes(self.attack.meshes(*self._attacked(appearance)))
+        if self.street_edit is not None:
+            town.add_meshes(self.street_edit.meshes())
 
     def visible_objects(self, sight: AgentView) -> tuple[SceneObject, ...]:
         """The bodies that an agent could see."""
         scene_objects = sight.town.objects(sight.appearance, sight.moment, without=sight.agent)
+        if self.street_edit is not None:
+            indices = sight.town.indices(self.street_edit.meshes())
+            return self.street_edit.objects(scene_objects, sight.appearance.route, indices, sight.town.sign_kinds)
         if self.attack is None:
             return scene_objects
         (target_key, *_) = self.attack.meshes(*self._attacked(sight.appearance))
@@ -229,6 +243,8 @@ class Onboard:
 
     def edit(self, sight: AgentView) -> SceneEdit | None:
         """Return the edit of an episode, the same for all episodes whose attacked agent is of one model."""
+        if self.street_edit is not None:
+            return self.street_edit.edit if self.street_edit.edit.textures else None
         return None if self.attack is None else self.attack.body(*self._attacked(sight.appearance))[1]
 
     def _attacked(self, appearance: Appearance) -> tuple[str, tuple[float, ...]]:
@@ -301,6 +317,8 @@ class Onboard:
         # The noise depends on nothing else, so a trace reproduces the reading to the bit.
         noise_seed = int(digest("onboard noise", appearance.key, moment.step, agent, camera.channel)[:7], 16)
         view = View(camera, camera_pose, (*scene_objects, *lit_lenses), weather, self.response, noise_seed, lamps)
+        if self.street_edit is not None:
+            return self.street_edit.on(view, appearance.route, sight.town.heads)
         edit = self.edit(sight)
         if edit is None or self.attack is None:
             return view

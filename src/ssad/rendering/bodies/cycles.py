@@ -54,6 +54,14 @@ SMALL_MUDGUARD = (
     (0.74, 0.09, 0.46, 0.52),
     (0.90, 0.06, 0.32, 0.40),
 )
+ENGINE = ((-0.26, 0.13, 0.26, 0.50), (-0.05, 0.17, 0.22, 0.56), (0.12, 0.16, 0.24, 0.66), (0.30, 0.11, 0.30, 0.56))
+FRAME_COVER = (
+    (-0.56, 0.06, 0.64, 0.78),
+    (-0.30, 0.12, 0.46, 0.80),
+    (-0.05, 0.13, 0.48, 0.82),
+    (0.32, 0.07, 0.62, 0.86),
+)
+ENGINE_BLOCK = Material("engine", (0.045, 0.045, 0.048), specular=0.12, gloss=0.5)
 FAIRING = ((0.12, 0.24, 0.38, 0.80), (0.45, 0.22, 0.46, 1.00), (0.72, 0.13, 0.76, 1.02), (0.80, 0.05, 0.82, 0.96))
 
 
@@ -240,8 +248,9 @@ def _tyres(axles: Sequence[tuple[float, float]], radius: float, detail: int) -> 
         tyre = ring(radius, half_width, material=RUBBER, segments=segments, around=(4, 5, 8)[detail])
         parts.append(tyre.moved(x, 0.0, radius))
         if detail:
-            rim_disc = wheel(0.75 * radius, 0.07, detail=detail, rim=0.97, spokes=5)
-            parts.append(both_sides(rim_disc).moved(x, 0.0, radius))
+            # Each half keeps to its side: the inner end of one would hide the spokes of the other.
+            rim_disc = wheel(0.80 * radius, 0.04, detail=detail, rim=0.94, spokes=5)
+            parts.append(both_sides(rim_disc.moved(y=0.022)).moved(x, 0.0, radius))
     return parts
 
 
@@ -266,15 +275,20 @@ def _motorbike(segments: int, detail: int, *, fairing: bool) -> tuple[list[Mesh]
     parts.append(
         _pod([(-0.74, 0.13, 0.84, 0.94), (-0.35, 0.16, 0.78, 0.85), (-0.10, 0.12, 0.78, 0.86)], segments, TRIM)
     )
-    parts.append(_pod([(-0.28, 0.17, 0.26, 0.62), (-0.05, 0.20, 0.22, 0.70), (0.28, 0.17, 0.28, 0.66)], segments, DARK))
-    parts.append(crate((-0.05, -0.25, 0.30), (0.12, 0.25, 0.42), STEEL))
+    parts.append(_pod(ENGINE, segments, ENGINE_BLOCK))
+    parts.append(_pod(FRAME_COVER, segments, TRIM))
+    parts.append(crate((-0.06, -0.21, 0.28), (0.10, 0.21, 0.40), STEEL))
     fork_crown = np.array([0.40, 0.0, 0.95])
     side_offset = np.array([0.0, 0.09, 0.0])
     parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, segments))
+    parts.append(tube([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)], 0.04, material=FRAME, segments=segments))
     if detail:
         parts.append(
             tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, segments)
         )
+        parts.append(tubes([(-0.48, 0.10, 0.70), rear_hub + np.array([0.04, 0.10, 0.06])], 0.022, STEEL, segments))
+        for z in (0.46, 0.52, 0.58):  # cooling fins
+            parts.append(crate((0.02, -0.15, z), (0.22, 0.15, z + 0.02), STEEL))
         exhaust = [(0.15, -0.16, 0.24), (-0.45, -0.20, 0.24), (-0.82, -0.22, 0.42)]
         parts.append(tube(exhaust, [0.03, 0.045, 0.06], material=CHROME, segments=segments))
         blinker = sphere((0.03, 0.03, 0.03), material=BLINKER, centre=(0.46, 0.20, 0.90), segments=6)
