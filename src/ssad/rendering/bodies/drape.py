@@ -121,8 +121,8 @@ class Surface:
         faces = faces[is_face]
         vertices, vertex_normals = positions.reshape(-1, 3), normals.reshape(-1, 3)
         # Cuts near a corner leave needles, which readers of mesh files weld away.
-        edges = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, -1, axis=1)], axis=-1)
-        is_needle = edges.min(axis=1) < NEEDLE
+        edge_lengths = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, -1, axis=1)], axis=-1)
+        is_needle = edge_lengths.min(axis=1) < NEEDLE
         faces, material = faces[~is_needle], material[~is_needle]
         directions = cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
         is_turned = sign * directions[:, axis] < 0.0
