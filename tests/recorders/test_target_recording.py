@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import ConfigError
-from ssad.experiments.perception.physical.target_table import Approach
+from ssad.experiments.perception.physical.target_table import ApproachViews
 from ssad.recorders.target_images import _camera
 from ssad.recorders.target_recording import TargetRecording, height_in_pixels
 from ssad.rendering.target import TargetCar
@@ -16,7 +16,7 @@ from ssad.rendering.target import TargetCar
 
 def test_a_car_at_the_end_of_an_approach_is_24_pixels_high() -> None:
     """The formula is that of the recorder's own camera: an upright stick, projected."""
-    approach, height = Approach(), TargetCar().full_size[2]
+    approach, height = ApproachViews(), TargetCar().full_size[2]
     distance = max(approach.distances)
     assert distance == 80.0
     camera = _camera(approach.size)
