@@ -151,7 +151,7 @@ def _probe_poses(centre: F64) -> F64:
     for index, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         # columns: right, down, ahead
         poses[index, :3, :3] = np.array([[y, -x, 0], [0, 0, -1], [x, y, 0]], np.float64).T
-    poses[4, :3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], np.float64).T
+    poses[4, :3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float64).T
     return poses
 
 
