@@ -22,6 +22,13 @@ DETECTORS: dict[str, str] = {
 }
 ONNX = "onnx:"
 """Before the name of a file: an exported detector (`ssad.detectors.adapters.onnx_detector`)."""
+CENTERNET = "centernet:"
+"""Before the archive of an npm package: a detector that saw photographs (`ssad.detectors.adapters.centernet`)."""
+FILES: dict[str, str] = {
+    ONNX: "ssad.detectors.adapters.onnx_detector:onnx_detector",
+    CENTERNET: "ssad.detectors.adapters.centernet:centernet_detector",
+}
+"""Prefix of a name that goes on with a file -> builder that takes the file, which holds the weights."""
 SHIPPED = Path(__file__).parent / "weights"
 
 
@@ -31,20 +38,28 @@ def detector_names() -> dict[str, str]:
 
 
 def resolve_detector(name: str) -> Any:
-    """Return the builder of a detector; that of "onnx:FILE" takes what follows the file's name.
+    """Return the builder of a detector; that of "onnx:FILE" or "centernet:FILE" takes what follows the file's name.
 
     Args:
         name: Name of the detector, without arguments.
 
     Raises:
         SSADError: See `ssad.core.registry.resolve`; the packages of `onnx:FILE` are not installed.
+        FormatError: There is no such file.
     """
-    if not name.startswith(ONNX):
+    prefix = file_prefix(name)
+    if not prefix:
         return resolve("detector", DETECTORS, name)
-    path = Path(name.removeprefix(ONNX)).expanduser()
-    if not path.is_file():
-        raise FormatError(f"detector '{name}': no file {path}; name one that exists: {ONNX}FILE.onnx")
-    return partial(resolve("detector", {name: "ssad.detectors.adapters.onnx_detector:onnx_detector"}, name), path)
+    path = Path(name.removeprefix(prefix)).expanduser()
+    if not path.is_file() and not (prefix == CENTERNET and path.is_dir()):
+        example = "FILE.onnx" if prefix == ONNX else "FILE.tgz (npm pack @vladmandic/human writes it)"
+        raise FormatError(f"detector '{name}': no file {path}; name one that exists: {prefix}{example}")
+    return partial(resolve("detector", {name: FILES[prefix]}, name), path)
+
+
+def file_prefix(name: str) -> str:
+    """Return the prefix of `FILES` that a name of a detector begins with; "" for none."""
+    return next((prefix for prefix in FILES if name.startswith(prefix)), "")
 
 
 def make_detector(
@@ -69,7 +84,7 @@ def make_detector(
     builder = resolve_detector(reference.name)
     check_arguments("detector", name, builder, extra_arguments=options)
     name, options = reference.name, {**reference.options, **options}
-    if name.startswith(ONNX) and weights is not None:
+    if file_prefix(name) and weights is not None:
         raise ConfigError(f"detector '{name}': the file holds its weights; it takes no others")
     if name not in DETECTORS:
         detector = make("detector", name, builder, options, ("task", "classes", "predict"))

@@ -23,6 +23,7 @@ KINDS: dict[str, str] = {
     "detection": "ssad.experiments.perception.shifts.kind:Detection",
     "digital": "ssad.experiments.perception.digital.kind:Digital",
     "physical": "ssad.experiments.perception.physical.kind:Physical",
+    "reality": "ssad.experiments.perception.reality.kind:Reality",
     "adversarial": "ssad.experiments.adversarial.kind:Adversarial",
     "gap": "ssad.experiments.gap.kind:Gap",
     "how-often": "ssad.experiments.how_often.kind:HowOften",

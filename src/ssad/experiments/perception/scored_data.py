@@ -18,7 +18,7 @@ from ssad.core.schema import Names, Schema
 from ssad.core.source import plugin_version
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.detectors import DETECTORS, ONNX, SHIPPED
+from ssad.detectors import DETECTORS, SHIPPED, file_prefix
 from ssad.experiments.perception.scene_boxes import detector_of
 from ssad.recorders.nuscenes import Recording
 from ssad.rendering.target import Target, class_of_target
@@ -123,7 +123,7 @@ def detectors_of(
             if class_name not in detector.classes:
                 raise ConfigError(f"suite {suite}: {name} has no class {class_name}, which wears a texture or light")
         # The hash of an export's state is that of its file.
-        is_export = detector_name.startswith(ONNX)
+        is_export = bool(file_prefix(detector_name))
         source = "" if is_export else plugin_version("detector", DETECTORS, detector_name)
         victims.weights[name], victims.files[name] = " ".join(filter(None, (state_hash(detector), source))), path
         victims.tasks[name] = task

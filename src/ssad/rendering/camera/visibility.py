@@ -40,6 +40,7 @@ class VisibilityPass:
         draw_table.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
         draw_table.tags = wp.array(draws.tags, dtype=int, device=device)
         draw_table.lit = wp.array(draws.lit, dtype=int, device=device)
+        draw_table.split = wp.array(draws.splits, dtype=wp.vec2, device=device)
         self.lens = wp.array(lens, dtype=wp.vec4, device=device)
         views = wp.array(draws.views, dtype=int, device=device)
         height, width = size[0] * scale, size[1] * scale

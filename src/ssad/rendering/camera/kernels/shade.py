@@ -8,7 +8,7 @@ paint and wet roads, fog and haze by distance.
 import warp as wp
 
 from ssad.rendering.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
-from ssad.rendering.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness, spot_of
+from ssad.rendering.camera.kernels.light import CELLS, Near, cell_of, lamp_at, lamp_emission, openness, spot_of
 from ssad.rendering.camera.kernels.matter import GLASS, Surface, textured
 from ssad.rendering.camera.kernels.probe import ROUGH, Probes, mirrored_light
 from ssad.rendering.camera.kernels.raster import LAST, REGISTERS
@@ -49,7 +49,8 @@ class DrawRanges:
         matrices: Object to camera, of each draw.
         paints: Linear RGB of each draw.
         tags: Tag of each draw.
-        lit: 1 where the lamps of the draw's body are on.
+        lit: Bits of the lamps of the draw's body, as of `ssad.rendering.camera.kernels.light.LAMPS_ON`.
+        split: Distance from the body's axis beyond which head lamps and tail lamps are indicators, m.
     """
 
     samples: wp.array3d(dtype=wp.uint64)
@@ -58,6 +59,7 @@ class DrawRanges:
     paints: wp.array(dtype=wp.vec3)
     tags: wp.array(dtype=int)
     lit: wp.array(dtype=int)
+    split: wp.array(dtype=wp.vec2)
 
 
 @wp.struct
@@ -270,7 +272,7 @@ def reflected_light(
     row: int,
     surface: Surface,
     albedo: wp.vec3,
-    glow: float,
+    emission: wp.vec3,
     hit: Hit,
     lit: PointLight,
     away: wp.vec3,
@@ -282,7 +284,7 @@ def reflected_light(
     result = SurfaceLight()
     n = hit.normal
     p = hit.place
-    colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
+    colour = wp.cw_mul(albedo, lit.light) + emission
     gain = lit.light
     mirror = surface.specular
     gloss = surface.gloss
@@ -566,10 +568,17 @@ def shade_pixel(
                     if hit.normal[2] > 0.7:
                         open_ = openness(near, row, hit.place)
                 lit = light_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
-                glow = surface.emission + surface.night * light.lamps
-                if surface.lamp == 1 and draw_samples.lit[hit.draw] == 0:
-                    glow = 0.0
-                shaded = reflected_light(light, near, probes, view, out.wet, row, surface, albedo, glow, hit, lit, away)
+                side = float(0.0)
+                if surface.lamp > 0:
+                    to_camera = draw_samples.matrices[hit.draw]
+                    leftward = wp.vec3(to_camera[0, 1], to_camera[1, 1], to_camera[2, 1])
+                    side = wp.dot(leftward, ray * hit.z - wp.vec3(to_camera[0, 3], to_camera[1, 3], to_camera[2, 3]))
+                emission = lamp_emission(
+                    surface, draw_samples.lit[hit.draw], side, draw_samples.split[hit.draw], light.lamps
+                )
+                shaded = reflected_light(
+                    light, near, probes, view, out.wet, row, surface, albedo, emission, hit, lit, away
+                )
                 colour = shaded.colour
                 share = float(covered) / float(count)
                 if out.wet == 1:

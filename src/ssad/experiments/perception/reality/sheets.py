@@ -1,0 +1,189 @@
+"""Pictures of a run on photographs: boxes in the photographs, and cars with and without textures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from ssad.core import safeio
+from ssad.core.errors import SSADError
+from ssad.core.images import add_caption, save_picture
+from ssad.core.registry import label_of
+from ssad.core.types import F64, U8
+from ssad.datasets.photographs import Photograph
+from ssad.detectors.drawing import FOUND, TRUE
+from ssad.engine.kind import Cell, Plan
+from ssad.experiments.perception.reality.photograph_boxes import (
+    ROAD_CLASSES,
+    PhotographBoxes,
+    boxes_file,
+    kept_boxes,
+)
+from ssad.experiments.perception.reality.worn_textures import (
+    TRAINED,
+    WornCar,
+    car_scores,
+    drawn_colour,
+    worn_images,
+)
+from ssad.scenarios.static.physical.textures.photographs import face_print
+
+SHOWN: Final = 6  # photographs on a sheet
+SHOWN_CARS: Final = 3
+WIDTH, CAR_WIDTH, COLUMNS = 800, 320, 2
+AROUND: Final = 2.5  # side of what is shown of a car, in longer sides of its box
+
+
+def write_sheets(plan: Plan, folder: Path, photographs: Sequence[Photograph], cars: Sequence[WornCar]) -> None:
+    """Write the pictures of all detectors and textures, and their captions, from the boxes of a results folder.
+
+    Args:
+        plan: The plan of the run.
+        folder: The results folder.
+        photographs: The photographs.
+        cars: The cars that wear textures.
+    """
+    captions: dict[str, str] = {}
+    for number, system in enumerate(plan.details):
+        cells = [cell for cell in plan.cells if cell.system == system]
+        clean_path = folder / cells[0].spec["clean_boxes"]
+        if not clean_path.is_file():
+            continue
+        try:
+            clean = kept_boxes(clean_path, _absent)
+            path = folder / "pictures" / f"{number + 1}-photographs.jpg"
+            save_picture(path, photograph_sheet(photographs, clean, plan.suite.score))
+            captions[path.name] = (
+                f"{label_of(system)} on photographs: boxes of at least {plan.suite.score:g} (orange) and annotated "
+                "objects (white; grey: ignored)."
+            )
+            for index, texture in enumerate(plan.suite.textures):
+                worn_cells = [cell for cell in cells if cell.spec["texture"] == texture]
+                sheet = worn_sheet(worn_cells, folder, photographs, cars, clean)
+                if sheet is not None:
+                    path = folder / "pictures" / f"{number + 1}-{index + 1}-worn.jpg"
+                    save_picture(path, sheet)
+                    captions[path.name] = (
+                        f"{worn_cells[0].fields['texture']} on cars in photographs, and its controls; the scores are "
+                        f"those with which {label_of(system)} finds the car (0: not at all)."
+                    )
+        except SSADError:  # a photograph that cannot be read has failed its cells, which say so
+            continue
+    if captions:
+        safeio.write_atomic(folder / "pictures" / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
+
+
+def _absent() -> PhotographBoxes:
+    raise AssertionError
+
+
+def photograph_sheet(photographs: Sequence[Photograph], boxes: PhotographBoxes, score: float) -> U8:
+    """Return the photographs with most objects, with annotated objects and boxes.
+
+    Args:
+        photographs: The photographs.
+        boxes: Boxes in them.
+        score: Least score of a box that is drawn.
+    """
+    richest = sorted(range(len(photographs)), key=lambda number: -int((~photographs[number].ignored).sum()))[:SHOWN]
+    tiles = []
+    for number in sorted(richest):
+        photograph = photographs[number]
+        image = photograph.read()
+        scale = WIDTH / image.shape[1]
+        canvas = cv2.resize(image, (WIDTH, round(scale * image.shape[0])), interpolation=cv2.INTER_AREA)
+        for box, is_ignored in zip(photograph.box * scale, photograph.ignored.tolist(), strict=True):
+            _rectangle(canvas, box, (128, 128, 128) if is_ignored else TRUE, 1)
+        rows = (boxes.image == number) & (boxes.score >= score)
+        for box, label, value in zip(boxes.box[rows] * scale, boxes.label[rows], boxes.score[rows], strict=True):
+            _rectangle(canvas, box, FOUND, 2)
+            _write(canvas, f"{ROAD_CLASSES[label]} {value:.2f}", box)
+        tiles.append(add_caption(canvas, photograph.name, WIDTH))
+    return _grid(tiles, COLUMNS)
+
+
+def worn_sheet(
+    cells: Sequence[Cell],
+    folder: Path,
+    photographs: Sequence[Photograph],
+    cars: Sequence[WornCar],
+    clean: PhotographBoxes,
+) -> U8 | None:
+    """Return the highest cars clean, with a texture and with the first draw of each control; None without cells.
+
+    Args:
+        cells: Cells of one detector and one texture.
+        folder: The results folder.
+        photographs: The photographs.
+        cars: The cars that wear textures.
+        clean: Boxes in the clean photographs.
+    """
+    highest = sorted(cars, key=lambda car: -float(_height(photographs, car)))[:SHOWN_CARS]
+    finished = [cell for cell in cells if (folder / boxes_file(cell.system, f"{cell.key} 0")).is_file()]
+    if not highest or not finished:
+        return None
+    variants: list[tuple[str, dict[int, U8], F64]] = [
+        (
+            "clean",
+            {car.image: photographs[car.image].read() for car in highest},
+            car_scores(photographs, highest, clean),
+        )
+    ]
+    for cell in finished:
+        worn = face_print(cell.spec["texture"])
+        colour = drawn_colour(worn, cell.fields["pasted"], 0)
+        chosen = [car for car in cars if car.image in variants[0][1]]
+        images = {number: image for number, image, _ in worn_images(photographs, chosen, worn, colour)}
+        boxes = kept_boxes(folder / boxes_file(cell.system, f"{cell.key} 0"), _absent)
+        title = cell.fields["texture"] if cell.fields["pasted"] == TRAINED else cell.fields["pasted"]
+        variants.append((title, images, car_scores(photographs, highest, boxes)))
+    tiles = []
+    for index, car in enumerate(highest):
+        for title, images, scores in variants:
+            crop = _crop(images[car.image], photographs[car.image].box[car.row])
+            tiles.append(add_caption(crop, f"{title}: {scores[index]:.2f}", CAR_WIDTH))
+    return _grid(tiles, len(variants))
+
+
+def _height(photographs: Sequence[Photograph], car: WornCar) -> Any:
+    box = photographs[car.image].box[car.row]
+    return box[3] - box[1]
+
+
+def _crop(image: U8, box: F64) -> U8:
+    height, width = image.shape[:2]
+    side = int(min(AROUND * (box[2:] - box[:2]).max(), height, width))
+    left = int(np.clip((box[0] + box[2] - side) / 2, 0, width - side))
+    top = int(np.clip((box[1] + box[3] - side) / 2, 0, height - side))
+    part = np.ascontiguousarray(image[top : top + side, left : left + side])
+    return np.asarray(cv2.resize(part, (CAR_WIDTH, CAR_WIDTH), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _grid(tiles: list[U8], columns: int) -> U8:
+    """Return tiles side by side in rows; tiles of a row are padded to one height, rows to one width."""
+    rows = []
+    for start in range(0, len(tiles), columns):
+        row_tiles = tiles[start : start + columns]
+        height = max(tile.shape[0] for tile in row_tiles)
+        padded = [np.pad(tile, ((0, height - len(tile)), (0, 0), (0, 0)), constant_values=255) for tile in row_tiles]
+        rows.append(np.concatenate(padded, 1))
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate(
+        [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    )
+
+
+def _rectangle(canvas: U8, box: F64, colour: tuple[int, int, int], width: int) -> None:
+    left, top, right, bottom = (round(float(edge)) for edge in box)
+    cv2.rectangle(canvas, (left, top), (right, bottom), colour, width, cv2.LINE_AA)
+
+
+def _write(canvas: U8, text: str, box: F64) -> None:
+    position = (round(float(box[0])), max(round(float(box[1])) - 4, 12))
+    # A dark outline first, so that the text is readable on any background.
+    for colour, width in (((0, 0, 0), 3), (FOUND, 1)):
+        cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, width, cv2.LINE_AA)
