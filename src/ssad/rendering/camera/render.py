@@ -435,6 +435,8 @@ def _add_wet_reflections(output: Any, lens: Any, to_world: Any, lanes: int) -> N
     wp.launch(puddle.sum_columns, dim=(count, lanes), inputs=inputs, outputs=[sums, counts], device=device)
     inputs = [output.depth, lens, sums, counts, output.mirror, output.spread, lanes, output.radiance]
     wp.launch(puddle.add_mirror_image, dim=(count, height, lanes), inputs=inputs, device=device)
+
+
 def _with_effects(view: View, effects: frozenset[str]) -> View:
     """Return the view without the objects of effects that are off, and with the lamps of those that are on."""
     if "street-lighting" in effects and not view.weather.lighting:
