@@ -18,6 +18,7 @@ from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
 from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
+from ssad.rendering.street import cached_street
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.85, paint=True)
@@ -62,7 +63,7 @@ def test_effects_have_names(scene: RenderScene) -> None:
     assert select_effects("haze", "default") == DEFAULT_EFFECTS | {"haze"}
     assert render(scene, [view()], quality=only("haze")).effects == {"haze"}
     for wrong in (lambda: select_effects("fog lamp"), lambda: RenderQuality(effects=frozenset({"fog lamp"}))):
-        with pytest.raises(ConfigError, match="unknown effect of the rendering 'fog lamp'; there are .*haze"):
+        with pytest.raises(ConfigError, match=r"unknown effect of the rendering 'fog lamp'; there are .*haze"):
             wrong()
     assert all(effect.summary.endswith(".") and name == effect.name for name, effect in EFFECTS.items())
 
@@ -184,3 +185,20 @@ def test_textures_stay_linear_under_all_effects(scene: RenderScene) -> None:
     difference = np.abs(out.numpy() - painted.radiance)[0][body]
     # The probe shows the object itself, black or painted: its own mirror image is not part of the gradient.
     assert np.median(difference) < 1e-5
+
+
+def test_a_picture_of_a_street_depends_on_its_view_alone() -> None:
+    """Views in one square share a probe, in whatever order they are rendered."""
+    street = cached_street("Twinford")
+    eye = np.array([*street.lamps[0, :2], 1.5]) + (0.0, 3.0, 0.0)
+    views = []
+    for shift, heading in ((0.0, 0.7), (2.0, 0.7), (30.0, 2.1)):
+        pose = FORWARD.copy()
+        pose[:3, 3] = eye + (shift, 0.0, 0.0)
+        views.append(View(CAMERA, pose, weather=SceneWeather(0.6, heading, 0.2)))
+    effects = only("reflections", "wet-reflections", "soft-shadows", "haze")
+    together = render(RenderScene(street, []), views, quality=effects).radiance
+    other = RenderScene(street, [])
+    for index in (2, 1, 0, 2):
+        assert (render(other, [views[index]], quality=effects).radiance[0] == together[index]).all()
+    assert (render(other, views, quality=only()).radiance != together).any((1, 2, 3)).all()

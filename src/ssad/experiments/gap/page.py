@@ -14,10 +14,10 @@ from typing import Literal
 
 from ssad.core import safeio
 from ssad.core.folders import path_inside
-from ssad.experiments.gap.lane_figure import course_plot
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.rank import family_correlation
+from ssad.experiments.gap.lane_figure import course_plot
 from ssad.report.figures import MetricChange, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
