@@ -190,11 +190,11 @@ def test_textures_stay_linear_under_all_effects(scene: RenderScene) -> None:
 def test_a_picture_of_a_street_depends_on_its_view_alone() -> None:
     """Views in one square share a probe, in whatever order they are rendered."""
     street = cached_street("Twinford")
-    eye = np.array([*street.lamps[0, :2], 1.5]) + (0.0, 3.0, 0.0)
+    x, y = street.lamps[0, :2] + np.array([0.0, 3.0])
     views = []
     for shift, heading in ((0.0, 0.7), (2.0, 0.7), (30.0, 2.1)):
         pose = FORWARD.copy()
-        pose[:3, 3] = eye + (shift, 0.0, 0.0)
+        pose[:3, 3] = x + shift, y, 1.5
         views.append(View(CAMERA, pose, weather=SceneWeather(0.6, heading, 0.2)))
     effects = only("reflections", "wet-reflections", "soft-shadows", "haze")
     together = render(RenderScene(street, []), views, quality=effects).radiance
