@@ -16,7 +16,7 @@ from ssad.core.perception import PerceivedLane
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 
-SURE: Final = 0.5  # confidence from which on a lane counts as detected
+SURE: Final = 0.7  # confidence from which on a lane counts as detected
 
 
 @dataclass(frozen=True, eq=False)

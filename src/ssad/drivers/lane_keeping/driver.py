@@ -32,7 +32,7 @@ from ssad.drivers.lane_keeping.control import (
     pursuit_curvature,
     steer_for,
 )
-from ssad.drivers.lane_keeping.lane import LaneFilter
+from ssad.drivers.lane_keeping.lane import SURE, LaneFilter
 from ssad.drivers.lane_keeping.markings import RoadMap, TopView, marking_strength
 from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
 from ssad.drivers.perceiving.parts import Perceiver
@@ -40,7 +40,6 @@ from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_camera
 from ssad.world.models import agent_model
 
 CHANNEL: Final = "CAM_FRONT"
-SURE: Final = 0.5  # confidence from which on markings count as detected
 PATIENCE: Final = 1.5  # s without markings before it slows down
 
 

@@ -237,6 +237,7 @@ class Gap(ScenarioKind):
                     place = getattr(perturbation_of(cell.spec), "place_distance", None)
                     graph = cached_town(trace.town)
                     metrics |= lane_metrics(trace, graph, perceived.lanes, place=place, view=VIEW_AHEAD)
+                    metrics |= {name: None for name, value in metrics.items() if value != value}
                     record_fields["lane"] = lane_course(trace, graph)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
                 if job.settings["sheets"] and (sheet_images := perception.images(index)):
@@ -324,8 +325,9 @@ class Condition:
 
     @property
     def needs_target(self) -> bool:
-        """True if the perturbation needs an agent, or a sign, to be on."""
-        return self.perturbation is not None and self.perturbation.needs_target
+        """True if the perturbation needs an agent, a sign or a place along the route to be on."""
+        perturbation = self.perturbation
+        return perturbation is not None and (perturbation.needs_target or perturbation.needs_place)
 
 
 def conditions_of(suite: GapSuite) -> list[Condition]:

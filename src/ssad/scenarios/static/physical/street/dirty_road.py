@@ -122,7 +122,7 @@ class DirtyRoad(Perturbation):
         return EGO if has_place(episode, self.distance) else None
 
     @property
-    def needs_target(self) -> bool:
+    def needs_place(self) -> bool:
         """True: the route must pass its place."""
         return True
 

@@ -112,7 +112,7 @@ class Phantom(Perturbation):
         return self.distance
 
     @property
-    def needs_target(self) -> bool:
+    def needs_place(self) -> bool:
         """True: the route must pass its place."""
         return True
 
