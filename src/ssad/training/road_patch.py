@@ -33,6 +33,7 @@ DASH, PERIOD = 3.0, 9.0  # m
 EXPOSURE = 0.78  # code value over albedo, both linear
 FOOTPRINT = 1.0 / 764.0  # 1/m: a pixel row covers so much times the square of the distance, m
 ENOUGH = 2.5  # m
+COARSE = TopView(half_width=4.0, row_step=1.0)
 LANE_WIDTH = 3.5  # m
 LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
 
@@ -125,7 +126,7 @@ def marking_strength(brightness: Tensor, grid: TopView) -> Tensor:
 
 
 class LaneModel:
-    """Differentiable copy of `ssad.drivers.lane_keeping.lane.LaneFilter`.
+    """Differentiable copy of `ssad.drivers.lane_keeping.lane.LaneFilter`, which is always sure of its markings.
 
     Args:
         grid: Top view.
@@ -240,6 +241,7 @@ def train_road_patch(
     side: float = 1.0,
     seed: int = 0,
     report: bool = False,
+    grid: TopView = COARSE,
 ) -> tuple[Tensor, list[float]]:
     """Return the albedo [H, W] of a patch that leads the lane keeper out of its lane, and the deviations, m.
 
@@ -252,8 +254,8 @@ def train_road_patch(
         side: 1: to the left; -1: to the right.
         seed: Seed of the approaches and of the first patch.
         report: Whether each fifth step is printed.
+        grid: Top view of the lane keeper, coarser than its own.
     """
-    grid = TopView(half_width=4.0, row_step=1.0)
     share = start_patch(width, shift=1.6 * side, seed=seed).clamp(0.0, 1.0).requires_grad_()
     optimiser = torch.optim.Adam([share], lr=rate)
     history = []
@@ -294,7 +296,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         weights="",
         target="road",
         data="straight roads of the differentiable copy of its loop",
-        command=f"python -m ssad.training.road_patch --width {options.width:g} --steps {options.steps} --seed {options.seed}",
+        command=f"python -m ssad.training.road_patch --width {options.width:g} --steps {options.steps} "
+        f"--seed {options.seed}",
         epochs=options.steps,
         metrics={"deviation": float(np.mean(history[-10:]))},
     )

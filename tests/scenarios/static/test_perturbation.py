@@ -185,7 +185,9 @@ def test_every_texture_and_light_acts_on_its_recorded_target(target_images: Call
             on_target(perturbation, target_images(perturbation.target))
 
 
-@pytest.mark.parametrize("name", ["grey", "das-yolov5n-twinford", "grey-sign", "flashlight", "shadow", "night", "dirty-road"])
+@pytest.mark.parametrize(
+    "name", ["grey", "das-yolov5n-twinford", "grey-sign", "flashlight", "shadow", "night", "dirty-road"]
+)
 def test_it_acts_on_a_recorded_target(name: str, target_images: Callable[[str], Path]) -> None:
     (perturbation,) = parse_perturbation(name).at([3])
     target = perturbation.target or "sedan"

@@ -106,7 +106,7 @@ class LaneFilter:
                 weights.append(float(weight.sum()))
             self.state = np.linalg.solve(information, pull)
             self.state[3] = np.clip(self.state[3], *WIDTHS)
-            total = sum(weights)
+            total = sum(weights) * self.grid.row_step / NOISE_STEP
             confidence = total / (total + HALF_ROWS)
             covariance = np.linalg.inv(information)
         self._is_sure = confidence >= SURE

@@ -513,7 +513,7 @@ def is_path(name: str) -> bool:
     return any((folder / card_name).is_file() for card_name in ("light.json", "texture.json"))
 
 
-def _make_object(
+def _make_object(  # noqa: PLR0917  # plain values
     kind: str,
     name: str,
     options: Mapping[str, Any],

@@ -27,7 +27,14 @@ from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.rendering.camera.photometry import illuminance
 from ssad.rendering.hours import SUN
 from ssad.rendering.street_edit import route_pose
-from ssad.scenarios.static.perturbation import EGO, Perturbation, PerturbedScene, RecordedScene, SceneVictim, TargetImages
+from ssad.scenarios.static.perturbation import (
+    EGO,
+    Perturbation,
+    PerturbedScene,
+    RecordedScene,
+    SceneVictim,
+    TargetImages,
+)
 from ssad.scenarios.static.physical.street.dirty_road import EDGE, has_place
 from ssad.scenarios.static.physical.street.placing import decode, encode
 

@@ -31,7 +31,14 @@ from ssad.rendering.hours import HOURS, SUN, at_hour
 from ssad.rendering.meshes.mesh import Material, Mesh
 from ssad.rendering.meshes.mesh import build as build_mesh
 from ssad.rendering.street_edit import StreetEdit
-from ssad.scenarios.static.perturbation import EGO, Perturbation, PerturbedScene, RecordedScene, SceneVictim, TargetImages
+from ssad.scenarios.static.perturbation import (
+    EGO,
+    Perturbation,
+    PerturbedScene,
+    RecordedScene,
+    SceneVictim,
+    TargetImages,
+)
 from ssad.scenarios.static.physical.lights.light import aimed_poses, first_array
 from ssad.scenarios.static.physical.street.dirty_road import EDGE, has_place
 from ssad.scenarios.static.physical.street.placing import behind_target, decode, painted_scene
@@ -204,10 +211,10 @@ def screen_mesh() -> Mesh:
     """Return a board that faces against x, with its foot on the ground."""
     half, thickness = 0.5 * SCREEN_WIDTH, 0.04
     front = np.array([(0, half, 0), (0, -half, 0), (0, -half, SCREEN_HEIGHT), (0, half, SCREEN_HEIGHT)], np.float64)
-    back = front + [thickness, 0.0, 0.0]
+    back = front + np.array([thickness, 0.0, 0.0])
     points = np.concatenate([front, back])
     quads = [(0, 3, 2, 1), (4, 5, 6, 7), (3, 7, 6, 2), (0, 4, 7, 3), (1, 2, 6, 5)]
-    faces = np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (a, d, c))])
     return build_mesh(points, faces, materials=SCREEN, smooth=0.0)
 
 
