@@ -306,9 +306,9 @@ def lane_table(run: Run) -> Table:
         metric=_cell,
         condition=lambda lines: not all(math.isnan(metric_of(line, "lane_deviation")) for line in lines),
         note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, share of it "
-        "that is completed. A drive leaves the lane where the body crosses a line; after: from the moment when the cause "
-        "comes into view, or from the start where there is none, of the drives that do. From the middle: mean distance "
-        "to it. Error of the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
+        "that is completed. A drive leaves the lane where the body crosses a line; after: from the moment when the "
+        "cause comes into view, or from the start where there is none, of the drives that do. From the middle: mean "
+        "distance to it. Error of the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
     )
 
 
