@@ -11,8 +11,8 @@ from ssad.drivers.lane_keeping.markings import TopView
 from ssad.rendering.camera.texture import to_linear
 from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, DIRT, WIDE
 from ssad.training.road_patch import (
-    Approach,
     LaneModel,
+    RoadApproach,
     deviation,
     draw_approaches,
     marking_strength,
@@ -23,7 +23,7 @@ from ssad.training.road_patch import (
 )
 
 GRID = TopView(half_width=4.0, row_step=2.0, far=28.0, column_step=0.1)
-APPROACH = Approach(15.0, 0.1, 3.5, 2.0, False, 1.0)
+APPROACH = RoadApproach(15.0, 0.1, 3.5, 2.0, False, 1.0)
 CLEAN = torch.full((48, 52), ASPHALT_ALBEDO)
 
 

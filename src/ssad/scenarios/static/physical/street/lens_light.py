@@ -201,12 +201,12 @@ class LensLight(Perturbation):
             scale: Luminance that fills the sensor, cd/m^2.
         """
         to_camera = np.linalg.inv(ego_to_world @ camera.to_ego)
-        x, y, z = (to_camera @ np.append(place, 1.0))[:3]
-        distance = float(np.sqrt(x * x + y * y + z * z))
-        if z < 0.5 or distance > VISIBLE:
+        right, down, depth = (to_camera @ np.append(place, 1.0))[:3]
+        distance = float(np.sqrt(right * right + down * down + depth * depth))
+        if depth < 0.5 or distance > VISIBLE:
             return image
-        u, v, _ = camera.intrinsic @ np.array([x, y, z]) / z
-        return encode(decode(image) + self.veil(camera, np.array([u, v]), distance, scale))
+        pixel_column, pixel_row, _ = camera.intrinsic @ np.array([right, down, depth]) / depth
+        return encode(decode(image) + self.veil(camera, np.array([pixel_column, pixel_row]), distance, scale))
 
     def veil(self, camera: Camera, pixel: F64, distance: float, scale: float) -> F32:
         """Return the linear light [H, W, 3] that a source adds to an image, 1 where it fills the sensor.
@@ -217,17 +217,19 @@ class LensLight(Perturbation):
             distance: m from the source.
             scale: Luminance that fills the sensor, cd/m^2.
         """
-        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        rays = np.stack([columns, rows, np.ones_like(columns)], -1) @ np.linalg.inv(camera.intrinsic).T
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        source = np.linalg.inv(camera.intrinsic) @ np.append(pixel, 1.0)
-        source /= np.linalg.norm(source)
-        angle = np.degrees(np.arccos(np.clip(rays @ source, -1.0, 1.0)))
-        luminance = self.scatter * GLARE * self.lux(distance) / (angle * angle + CORE * CORE)
-        # Colours share the luminance: a saturated colour fills its channel sooner, and then spills to white.
-        colour = np.array(COLOURS[self.source])
-        weight = float(colour @ [0.2126, 0.7152, 0.0722])
-        return np.asarray((luminance / scale)[..., None] * colour / weight, np.float32)
+        pixel_columns, pixel_rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        pixel_rays = (
+            np.stack([pixel_columns, pixel_rows, np.ones_like(pixel_columns)], -1) @ np.linalg.inv(camera.intrinsic).T
+        )
+        pixel_rays /= np.linalg.norm(pixel_rays, axis=-1, keepdims=True)
+        source_ray = np.linalg.inv(camera.intrinsic) @ np.append(pixel, 1.0)
+        source_ray /= np.linalg.norm(source_ray)
+        angle_degrees = np.degrees(np.arccos(np.clip(pixel_rays @ source_ray, -1.0, 1.0)))
+        luminance = self.scatter * GLARE * self.lux(distance) / (angle_degrees * angle_degrees + CORE * CORE)
+        # Colours share the luminance: a saturated source_colour fills its channel sooner, and then spills to white.
+        source_colour = np.array(COLOURS[self.source])
+        colour_luminance = float(source_colour @ [0.2126, 0.7152, 0.0722])
+        return np.asarray((luminance / scale)[..., None] * source_colour / colour_luminance, np.float32)
 
 
 def full_scale(sun_height: float) -> float:
@@ -249,16 +251,20 @@ class _LensFlare:
 
     def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
         """Add the light to the images of all egos, uint8 [N, 3, H, W]."""
-        changed = frames.copy()
-        for row, (frame, random) in enumerate(zip(frames, generators, strict=True)):
-            hit = random.random() < self.light.aim
-            first, count = truth.route[row, EGO].tolist()
-            if not frame.any() or not hit or not count:
+        changed_frames = frames.copy()
+        for scene_row, (ego_frame, frame_generator) in enumerate(zip(frames, generators, strict=True)):
+            beam_hits = frame_generator.random() < self.light.aim
+            first_point, point_count = truth.route[scene_row, EGO].tolist()
+            if not ego_frame.any() or not beam_hits or not point_count:
                 continue
-            route = truth.roads.path[first : first + count, :2].astype(np.float64)
-            place = route_pose(route, self.light.distance, self.light.lateral)[:3, 3] + [0.0, 0.0, self.light.height]
-            x, y, yaw = truth.pose[row, EGO].astype(np.float64).tolist()
-            image = np.ascontiguousarray(np.moveaxis(frame, 0, -1))
-            lit = self.light.shine(image, self.camera, upright_pose(x, y, yaw), place, self.scale)
-            changed[row] = np.moveaxis(lit, -1, 0)
-        return changed
+            route_points = truth.roads.path[first_point : first_point + point_count, :2].astype(np.float64)
+            source_place = route_pose(route_points, self.light.distance, self.light.lateral)[:3, 3] + [
+                0.0,
+                0.0,
+                self.light.height,
+            ]
+            x, y, yaw = truth.pose[scene_row, EGO].astype(np.float64).tolist()
+            clean_image = np.ascontiguousarray(np.moveaxis(ego_frame, 0, -1))
+            lit_image = self.light.shine(clean_image, self.camera, upright_pose(x, y, yaw), source_place, self.scale)
+            changed_frames[scene_row] = np.moveaxis(lit_image, -1, 0)
+        return changed_frames

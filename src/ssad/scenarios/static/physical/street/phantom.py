@@ -56,7 +56,7 @@ PICTURES: Final = {
 }
 BLANK: Final = "blank"
 SURFACES: Final = ("road", "screen")
-LUMENS: Final = (500.0, 1500.0, 5000.0, 15000.0, 50000.0)  # of a white picture, by severity
+LUMENS: Final = (20.0, 60.0, 200.0, 600.0, 2000.0)  # of a white picture, by severity; pocket projectors have 100
 TEXELS: Final = 96  # along the longer side of a picture
 STRETCH: Final = 4.0  # times: a picture on the road is longer, so that it looks less flat from the ego
 SCREEN_WIDTH, SCREEN_HEIGHT = 2.4, 2.4  # m
@@ -157,7 +157,7 @@ class Phantom(Perturbation):
             pose = first_array(aimed_poses(*(torch.tensor([values], dtype=torch.float64) for values in positions)))
             reach = PROJECTOR[0]
         spread = (0.5 * width / reach, 0.5 * height / reach)
-        lamp = SceneLamp(pose, self.flux, spread, square=True, texture=0, shadows=False)
+        lamp = SceneLamp(pose, self.flux, spread, square=True, texture=0)
         return SceneEdit(lamps=(lamp,), textures={0: self.light()})
 
     def street_edit(self) -> StreetEdit:
