@@ -161,10 +161,16 @@ def _detector_list() -> dict[str, str]:
     def describe(name: str, origin: str) -> str:
         if origin.startswith("ssad."):
             kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
-            return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
+            if not (SHIPPED / f"{name}.json").is_file():
+                return f"{kind}, no weights shipped"
+            return f"{kind}, weights shipped, which learned from images that SSAD rendered"
         return origin
 
     rows = {name: describe(name, origin) for name, origin in detector_names().items()}
+    rows |= {
+        "centernet:FILE": "2D, learned from photographs: npm pack @vladmandic/human (docs/how-to/use-detectors.md)",
+        "onnx:FILE": "2D, an exported detector (docs/how-to/use-detectors.md)",
+    }
     return rows | {"module:object": "a detector of your own (docs/how-to/use-detectors.md)"}
 
 
@@ -179,6 +185,12 @@ def _recipe_list() -> dict[str, str]:
     return detectors | {
         name: f"driver: {recipe.steps:,} steps, lr {recipe.lr:g}" for name, recipe in POLICY_RECIPES.items()
     }
+
+
+def _dimension_list() -> dict[str, str]:
+    from ssad.recorders.randomisation import DIMENSIONS
+
+    return {name: dimension.describe() for name, dimension in DIMENSIONS.items()}
 
 
 LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
@@ -199,6 +211,7 @@ LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "defences": _defence_list,
     "simulators": _simulator_list,
     "towns": _town_list,
+    "dimensions": _dimension_list,
 }
 """What can be listed -> makes its rows: name, and what it is."""
 ALIASES: Final = {"agents": "systems"}

@@ -14,6 +14,7 @@ from ssad.core.wording import counted
 from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
 from ssad.recorders.parts import PartsFolder
+from ssad.recorders.randomisation import NO_RANDOMISATION, Randomisation
 from ssad.rendering.target import Target, TargetSign, TargetWalker
 from ssad.world.roads import is_town
 
@@ -47,6 +48,7 @@ class TargetRecording:
         device: Device that renders.
         streets: See `drive_street`.
         weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
+        randomisation: What is drawn for each image and for each vehicle of a drive.
         approach: Distances of the following camera in place of `behind`, m of way, in turn; empty: `behind` alone.
 
     Raises:
@@ -69,6 +71,7 @@ class TargetRecording:
     device: str = "cpu"
     streets: str = "town"
     weathers: tuple[str, ...] = ()
+    randomisation: Randomisation = NO_RANDOMISATION
     approach: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -134,9 +137,11 @@ class TargetRecording:
         settings = asdict(replace(self, out=Path())) | {
             "clips": self.mode,
             "images": [list(pair) for pair in self.images],
+            "randomisation": self.randomisation.identity(),
         }
         # Empty values are left out, so that recordings without them keep their identity.
-        excluded = {"out", "mode"} | {name for name in ("weathers", "approach") if not settings[name]}
+        optional = ("weathers", "randomisation", "approach")
+        excluded = {"out", "mode"} | {name for name in optional if not settings[name]}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in settings.items()

@@ -22,47 +22,57 @@ from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest
-from ssad.core.types import F32, F64, I32, U8, AgentKind, End, EpisodeTrace
+from ssad.core.types import F32, F64, I32, U8, End, EpisodeTrace
 from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
+from ssad.rendering.camera.render import Rendering, RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit, render_with
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.sensor import SensorModel as Response
-from ssad.rendering.episode_scene import AgentPoses, Appearance, EpisodeScene, agent_poses, walked_distance
+from ssad.rendering.episode_scene import (
+    AgentPoses,
+    Appearance,
+    EpisodeScene,
+    agent_poses,
+    walked_distance,
+)
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
 from ssad.rendering.street_edit import StreetEdit
+from ssad.rendering.vehicle_signals import WITH_LAMPS, flashing, vehicle_signals, with_lamps
 from ssad.world.models import MODELS, agent_size
+from ssad.world.rollout import has_drivers
 
 DAY: Final = SceneWeather(0.9, 2.2, 0.3)
 AT_ONCE, AT_ONCE_GPU, AT_LEAST_GPU = 1, 192, 16  # views rendered in one call; on a CPU more do not pay
 VIEW_MEMORY: Final = 100 << 20  # bytes that a view of 640 x 360 needs on a GPU, with shadows and textures
-WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
 
 
 @dataclass(slots=True)
 class _Track:
-    """Poses of the agents of a scene since its episode began, one entry per step."""
+    """Poses, speeds and distances of the agents of a scene since its episode began, one entry per step."""
 
     episode: int
     appearance: Appearance
     pose: list[F32] = field(default_factory=list)
     walked: list[F64] = field(default_factory=list)
+    speed: list[F32] = field(default_factory=list)
 
-    def follow(self, step: int, pose: F32) -> None:
+    def follow(self, step: int, pose: F32, speed: F32) -> None:
         """Append a step; an earlier step discards the entries from there on."""
         if step < len(self.pose):
             if np.array_equal(self.pose[step], pose):
                 return
-            del self.pose[step:], self.walked[step:]
+            del self.pose[step:], self.walked[step:], self.speed[step:]
         previous_pose = self.pose[-1] if self.pose else pose
         walked = self.walked[-1] if self.walked else np.zeros(len(pose))
-        # steps before the first reading are unknown; they only affect the phase of walking cycles
+        # steps before the first reading are unknown; they only affect walking cycles and stop lamps
         missing_steps = step + 1 - len(self.pose)
         self.pose += [pose.copy()] * missing_steps
         self.walked += [walked_distance(walked, previous_pose, pose)] * missing_steps
+        self.speed += [speed.copy()] * missing_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +112,7 @@ class Onboard:
         device: Device that renders: cpu or cuda:0.
         attack: Edit of one of the agents, or of stop signs, that cameras and LiDARs see.
         resident: Whether images stay on a GPU, as torch tensors, for a driver that processes them there.
+        effects: Effects of the rendering that cameras show, see `ssad.rendering.camera.effects`.
         street_edit: Edit of the street that cameras and LiDARs see; not together with `attack`.
 
     Raises:
@@ -116,8 +127,10 @@ class Onboard:
         device: str = "cpu",
         attack: AgentEdit | None = None,
         resident: bool = False,
+        effects: frozenset[str] = DEFAULT_EFFECTS,
         street_edit: StreetEdit | None = None,
     ) -> None:
+        self.quality = RenderQuality(effects=effects)
         self.resident = resident and device != "cpu"
         self.at_once = AT_ONCE
         if device != "cpu":
@@ -192,7 +205,8 @@ class Onboard:
                 episode_spec = simulator.episodes[episode]
                 appearance = self.town(simulator.graphs[episode_spec.town]).appearance(episode_spec)
                 history = self._tracks[scene] = _Track(episode, appearance)
-            history.follow(step, state.pose[scene, : len(history.appearance.models)])
+            agent_count = len(history.appearance.models)
+            history.follow(step, state.pose[scene, :agent_count], state.speed[scene, :agent_count])
         return state
 
     def town(self, graph: LaneGraph) -> EpisodeScene:
@@ -234,8 +248,8 @@ class Onboard:
         views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
         edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
-            return render(scene, views, download=False)
-        rendering = render_with(scene, views, edit.textures, edit.masks)
+            return render(scene, views, quality=self.quality, download=False)
+        rendering = render_with(scene, views, edit.textures, edit.masks, quality=self.quality)
         image, tag, depth = (
             wp.array(array, device=self.device) for array in (rendering.image, rendering.tag, rendering.depth)
         )
@@ -264,8 +278,19 @@ class Onboard:
             if scene not in moments:
                 step, agent_count = _step_of(simulator, state, scene), len(history.appearance.models)
                 signal = state.signal[scene][history.appearance.signals]
+                # As in the trace, which keeps turn signals only of episodes with drivers of the population.
+                shows_turns = has_drivers(simulator.episodes[history.episode])
+                signals = vehicle_signals(
+                    history.speed[max(step - 1, 0)],
+                    history.speed[step],
+                    history.walked[step],
+                    state.turn_signal[scene, :agent_count] if shows_turns else np.zeros(agent_count, np.int8),
+                    simulator.dt,
+                    with_lamps(history.appearance.models),
+                )
+                lamps = flashing(signals, step * simulator.dt, np.arange(agent_count))
                 moments[scene] = AgentPoses(
-                    step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal
+                    step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal, lamps
                 )
             town = self.town(simulator.graphs[simulator.episodes[history.episode].town])
             agent_views.append(AgentView(row, town, history.appearance, moments[scene], agent))

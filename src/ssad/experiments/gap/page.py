@@ -66,8 +66,10 @@ LANES = {
 }
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
-BOUNDED = ("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
-BOUNDED += ("lane_departure", "lane_seen")
+BOUNDED = (
+    *("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40"),
+    *("lane_departure", "lane_seen"),
+)
 CONDITION = {
     "System": field("system"),
     "Perturbation": field("perturbation"),

@@ -35,7 +35,14 @@ EFFECTS: Final[dict[str, Effect]] = {
         Effect("reflections", "Glass, paint and metal mirror the sky, the buildings and the trees around the camera."),
         Effect("wet-reflections", "Wet roads mirror what stands on them."),
         Effect("soft-shadows", "The penumbra of the sun grows with the distance of what casts the shadow."),
+        Effect("lit-signals", "Traffic lights show their state.", is_default=True),
+        Effect("walker-signals", "Signals for walkers stand at crossings whose traffic has signals."),
+        Effect("vehicle-signals", "Stop lamps and indicators of vehicles shine."),
+        Effect("street-lighting", "Streets at night have the light of a class of EN 13201."),
+        Effect("low-beams", "The head lamps of vehicles have the pattern of a low beam, with a cut-off."),
         Effect("haze", "Distant surfaces fade into the light of the horizon in clear weather too."),
+        Effect("bloom", "The lens scatters light, so that the sun and lamps glow and veil what is near them."),
+        Effect("flare", "Bright lights have ghosts, which reflections between the surfaces of the lens make."),
     )
 }
 
