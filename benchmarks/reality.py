@@ -31,7 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "reality.json"
 LOG = ROOT / "benchmarks" / "results" / "reality-log.jsonl"
 PAGE = DOCS / "results" / "reality.md"
-FLAT, SOLID = ("yolov5n", "yolov3-tiny"), ("fcos3d-light", "fcos3d-light-robust", "pgd-det-light")
+FLAT = ("yolov5n", "yolov3-tiny")
+SOLID = ROOT / "benchmarks" / "reality-solid.yaml"
 PHOTO = "centernet-photo"
 PROBE = ("yolov5n", "adv-patch-yolov5n-twinford")
 TITLES = {"recall": "recall", "precision": "precision", "AP50": "AP50", "margin": "margin"}
@@ -50,12 +51,11 @@ def measure(data: Path, archive: Path | None, name: str, out: Path) -> None:
     identity: Mapping[str, Any] = {}
     weights: dict[str, str] = {}
     # Textures are made for 2D detectors; 3D ones are shown the clean photographs.
-    for part, detectors, changes in (("flat", flat, {}), ("solid", SOLID, {"textures": []})):
-        settings = {"data": str(data), "detectors": list(detectors), **changes}
-        results = ssad.run("reality", set=settings, out=out / part, workers=1)
+    for suite, changes in (("reality", {"detectors": flat}), (str(SOLID), {})):
+        results = ssad.run(suite, set={"data": str(data), **changes}, out=out / Path(suite).stem, workers=1)
         records += [row for row in results.rows if row["status"] == "ok"]
-        identity = results.header["inputs"]["data"]
-        weights |= {key.rpartition("@")[2]: value for key, value in results.header["inputs"]["weights"].items()}
+        identity = results.header["data"]
+        weights |= {key.rpartition("@")[2]: value for key, value in results.header["weights"].items()}
     stored = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     entry = {
         "data": dict(identity),
