@@ -8,7 +8,7 @@ import torch
 
 from ssad.core.detections import Detections, Truth
 from ssad.metrics.intervals import replicate_limits
-from ssad.metrics.target_attacks import TargetSighting, _precisions, precision, sighting, target_scores
+from ssad.metrics.target_attacks import TargetSighting, precision, precision_replicates, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 
@@ -172,7 +172,7 @@ def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
         for drives in drawn:
             picked = [pictures[k] for drive in drives for k in np.flatnonzero(of == drive)]
             naive.append(precision(picked, target_only=target_only, min_score=least))
-        assert _precisions(pictures, of, drawn, target_only=target_only, min_score=least) == naive
+        assert precision_replicates(pictures, of, drawn, target_only=target_only, min_score=least) == naive
         assert len(set(naive)) > 10
 
 
@@ -219,7 +219,7 @@ def test_drives_with_nothing_to_count_are_drawn_too() -> None:
     drive_draws = [np.array([5, 0, 1, 2, 3, 4]), np.array([0, 0, 5, 5, 4, 1])]
     drawn_scores = [precision([pictures[k] for k in draw], target_only=False, min_score=0.0) for draw in drive_draws]
     drives = np.arange(6, dtype=np.int32)
-    assert _precisions(pictures, drives, drive_draws, target_only=False, min_score=0.0) == drawn_scores
+    assert precision_replicates(pictures, drives, drive_draws, target_only=False, min_score=0.0) == drawn_scores
 
 
 @pytest.mark.parametrize(("score", "found"), [(0.25, 0.0), (0.2501, 1.0)])

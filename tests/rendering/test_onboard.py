@@ -16,15 +16,18 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Body, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, SignalState
 from ssad.rendering import onboard as loop_sensors
 from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.effects import select_effects
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.rig import rig_camera
+from ssad.rendering.camera.scene import LampSignal
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
-from ssad.rendering.episode_scene import LENSES, AgentPoses, agent_poses
+from ssad.rendering.episode_scene import AgentPoses, agent_poses
 from ssad.rendering.lidar import Lidar
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.onboard import Onboard
 from ssad.rendering.scene_objects import PHASES
+from ssad.rendering.signal_heads import LENSES
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
@@ -403,3 +406,32 @@ def test_signs_wear_a_texture_in_the_loop() -> None:
     clearly = np.abs(plain.astype(int) - grey).max(0) > 30
     redness = [(shown[0].astype(int) - shown[1])[clearly].mean() for shown in (plain, grey)]
     assert redness[0] > redness[1] + 20, "a red face turns grey"
+
+
+class Brakes(Watcher):
+    """Drives on for three steps, then brakes."""
+
+    def act(self, view):
+        braking = (view.time > 0.25)[:, None]
+        return np.where(braking, [0.0, 1.0, 0.0], [self.throttle, 0.0, 0.0]).astype(np.float32)
+
+
+class Follower(Onboard):
+    """Keeps the moments that it shows."""
+
+    def agent_views(self, simulator, agents):
+        views = super().agent_views(simulator, agents)
+        self.moments = [*getattr(self, "moments", []), views[0].moment] if views else self.moments
+        return views
+
+
+def test_stop_lamps_are_those_of_the_trace() -> None:
+    onboard = Follower(effects=select_effects("vehicle-signals"))
+    (trace,) = rollout(world(2), Brakes("front"), sensors={"front": onboard.camera(FRONT)})
+    recalled = agent_poses(trace)
+    assert len(onboard.moments) > 4
+    for moment in onboard.moments:
+        assert np.array_equal(moment.lamps, recalled[moment.step].lamps)
+    ego = [int(moment.lamps[0]) for moment in recalled]
+    assert not any(ego[:4])
+    assert all(bits & LampSignal.BRAKE for bits in ego[5:])

@@ -191,6 +191,13 @@ def record(
             "[default: another car in each part]"
         ),
     ] = None,
+    randomise: Annotated[
+        str,
+        typer.Option(
+            metavar="none|all|NAME,...|FILE.yaml",
+            help="For training data: vary paint, dirt, cameras, colours, noise and compression.",
+        ),
+    ] = "none",
     device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
     workers: Workers = None,
     ray: Ray = None,
@@ -202,6 +209,7 @@ def record(
     from ssad.core.machine import pick_device
     from ssad.engine.progress import LiveProgress
     from ssad.recorders.nuscenes import Recording, record_nuscenes
+    from ssad.recorders.randomisation import parse_randomisation
 
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -212,6 +220,7 @@ def record(
         parameter_source = context.get_parameter_source(name)
         if parameter_source is not None and parameter_source.name == "COMMANDLINE":
             raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
+    randomisation = parse_randomisation(randomise)
     unit = "parts" if clips is not None else "scenes"
     with LiveProgress("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
@@ -229,6 +238,7 @@ def record(
                 seed=seed,
                 device=pick_device(device),
                 streets=streets,
+                randomisation=randomisation,
             )
             record_target_images(target_recording, workers=workers, ray=ray, progress=progress.show)
             message = (
@@ -247,6 +257,7 @@ def record(
                 seed=seed,
                 device=pick_device(device),
                 streets=streets,
+                randomisation=randomisation,
             )
             record_nuscenes(recording, workers=workers, ray=ray, progress=progress.show)
             scene_count = counted(len(recording.towns) * scenes, "scene")

@@ -177,8 +177,8 @@ def shift_picture_folder(
         print(f"left out, since they need boxes in space: {', '.join(skipped_shifts)}")
     for folder in folders:
         report = f"{folder.root}: {counted(folder.shifted, 'picture')} shifted, "
-        report += f"{folder.clouds} point clouds shifted, " if folder.clouds else ""
-        report += f"{folder.linked} other files linked unchanged, "
+        report += f"{counted(folder.clouds, 'point cloud')} shifted, " if folder.clouds else ""
+        report += f"{counted(folder.linked, 'other file')} linked unchanged, "
         report += f"{folder.labels} of them images in folders of labels, " if folder.labels else ""
         report += f"{100 * folder.applied:.0f} % of the pictures changed"
         print(report + (f", {len(folder.reasons)} failed and left out" if folder.reasons else ""))

@@ -101,6 +101,31 @@ def no_tracks() -> Tracks:
     return Tracks(integers, integers, pairs, pairs, floats, pairs, integers, floats)
 
 
+@dataclass(frozen=True, slots=True)
+class PerceivedLane:
+    """Lane in the ego's frame at a moment, as a driver perceives it.
+
+    Its lines are y(x) = offset + heading x + curvature x^2 / 2 +- width / 2.
+
+    Attributes:
+        offset: Place of its middle beside the middle of the ego, m to the left.
+        heading: Slope of its middle there.
+        curvature: 1/m, positive to the left.
+        width: m.
+        confidence: Certainty that its markings were there in this image, 0 to 1.
+    """
+
+    offset: float
+    heading: float
+    curvature: float
+    width: float
+    confidence: float
+
+    def middle(self, ahead: float) -> float:
+        """Return the place of the middle of the lane `ahead` m in front, m to the left."""
+        return self.offset + self.heading * ahead + 0.5 * self.curvature * ahead * ahead
+
+
 @dataclass(frozen=True, eq=False)
 class DrivePerception:
     """Perception of a driver in one drive.
@@ -110,9 +135,11 @@ class DrivePerception:
         known: For each step its time, s, and the confirmed tracks.
         cameras: Its cameras.
         signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
+        lanes: For each step of a lane keeper its time, s, and the lane; None: it knew of none.
     """
 
     detections: Sequence[tuple[float, Objects | None]]
     tracks: Sequence[tuple[float, Tracks]]
     cameras: Mapping[str, Camera]
     signs: Sequence[tuple[float, F64]] = ()
+    lanes: Sequence[tuple[float, PerceivedLane | None]] = ()

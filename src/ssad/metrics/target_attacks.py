@@ -166,7 +166,9 @@ def target_scores(
             rng = generator("target scores", seed, name)
             # Whole drives are drawn: images of one drive are too similar to count as independent.
             drive_draws = [rng.integers(len(drives), size=len(drives)) for _ in range(replicates)]
-            values = _precisions(sightings, drive_indices, drive_draws, target_only=target_only, min_score=min_score)
+            values = precision_replicates(
+                sightings, drive_indices, drive_draws, target_only=target_only, min_score=min_score
+            )
             variance = np.asarray(np.var(values, ddof=1))
             lower_limit, upper_limit = replicate_limits(np.asarray(ap), variance, len(drives), bounded=True)
             intervals[name] = [float(lower_limit), float(upper_limit)]
@@ -229,7 +231,7 @@ def precision(sightings: Sequence[TargetSighting], *, target_only: bool = True, 
     return None if np.isnan(average_precision_value) else float(average_precision_value)
 
 
-def _precisions(
+def precision_replicates(
     sightings: Sequence[TargetSighting],
     selected_images: I32,
     drive_draws: Iterable[I64],

@@ -7,7 +7,7 @@ stopped at any moment and resumed, and the bytes do not depend on the number of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -32,15 +32,19 @@ from ssad.datasets.nuscenes.writer import NuScenesWriter, place_file
 from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import check_streets, drive_street, make_drive
 from ssad.recorders.parts import TIME_LIMIT, PartsFolder
-from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.recorders.randomisation import NO_RANDOMISATION, CameraDraw, Randomisation, describe_bodies
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, category_of
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.sensor import SENSOR
+from ssad.rendering.camera.street_lighting import UNLIT
 from ssad.rendering.lidar import HDL32E, points_in_boxes, sweep
 from ssad.rendering.scene_objects import PlacedObject, SceneObjects, place_objects
+from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street.model import Street
 from ssad.world.roads import is_town, load_town
 
@@ -62,6 +66,8 @@ AHEAD: Final = {
 }
 FIRST_SWEEP_END: Final = 0.1  # s, when the first sweep ends
 DRIVES_PER_STREET: Final = 4  # drives along one street where each street is built for the recording
+RANDOMISED: Final = "randomisation.json"  # in the folder of the tables: ranges, and what was drawn for each scene
+LIGHTING_SHARES: Final = {"M3": 0.15, "M4": 0.25, "M5": 0.15, "P2": 0.1, "P4": 0.15, "P5": 0.1, UNLIT: 0.1}  # of nights
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
@@ -82,6 +88,7 @@ class Recording:
         version: Version of the data set.
         device: Device that renders (it decides bits, though few: see docs/how-to/record-data.md).
         streets: See `drive_street`.
+        randomisation: What is drawn for each camera and each vehicle of a scene.
 
     Raises:
         ConfigError: A value is out of range.
@@ -99,6 +106,7 @@ class Recording:
     version: str = "v1.0-ssad"
     device: str = "cpu"
     streets: str = "town"
+    randomisation: Randomisation = NO_RANDOMISATION
 
     def __post_init__(self) -> None:
         for town in self.towns:
@@ -117,11 +125,13 @@ class Recording:
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that decide the bytes of the recording, as plain data."""
-        return {
+        settings = {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in asdict(self).items()
-            if name != "out"
+            if name not in ("out", "randomisation")
         }
+        # Left out where there is none, so that such recordings keep their identity.
+        return settings | ({"randomisation": self.randomisation.identity()} if self.randomisation else {})
 
 
 def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
@@ -137,9 +147,21 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
         "low": SceneWeather(float(rng.uniform(0.1, 0.3)), heading, float(rng.uniform(0.0, 0.5)), turn=turn),
         "fog": SceneWeather(sun_height, heading, 0.9, fog=float(rng.uniform(0.006, 0.025)), turn=turn),
         "wet": SceneWeather(sun_height, heading, 0.95, wet=float(rng.uniform(0.4, 1.0)), turn=turn),
-        "night": SceneWeather(float(rng.uniform(-0.3, -0.05)), heading, float(rng.uniform(0, 0.9)), turn=turn),
+        "night": SceneWeather(
+            float(rng.uniform(-0.3, -0.05)),
+            heading,
+            float(rng.uniform(0, 0.9)),
+            turn=turn,
+            lighting=draw_lighting(generator("record lighting", *key)),
+        ),
     }
     return by_kind[kind or str(drawn_kind)]
+
+
+def draw_lighting(draws: np.random.Generator) -> str:
+    """Draw the class of the street lighting of a night, if the effect `street-lighting` is on; else ""."""
+    lighting = str(draws.choice(list(LIGHTING_SHARES), p=list(LIGHTING_SHARES.values())))
+    return lighting if "street-lighting" in DEFAULT_EFFECTS else ""
 
 
 def describe_weather(weather: SceneWeather) -> str:
@@ -151,6 +173,8 @@ def describe_weather(weather: SceneWeather) -> str:
     ]
     if weather.fog:
         phrases.append(f"fog of {weather.fog:.3f}/m")
+    if weather.lighting:
+        phrases.append(f"street lighting {weather.lighting}")
     if weather.wet:
         phrases.append(f"wet road {weather.wet:.0%}")
     return ", ".join(phrases).replace("%", " %")
@@ -169,7 +193,7 @@ def attributes_of(placed_object: PlacedObject) -> tuple[str, ...]:
     if body.kind == "pedestrian":
         return ("pedestrian.moving",) if moving else ("pedestrian.standing",)
     if body.kind in ("motorcycle", "bicycle"):
-        return ("cycle.with_rider",) if body.style == "ridden" else ("cycle.without_rider",)
+        return ("cycle.without_rider",) if body.style == "parked" else ("cycle.with_rider",)
     if body.kind in ("traffic_cone", "barrier"):
         return ()
     return ("vehicle.parked",) if body.is_parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
@@ -222,10 +246,13 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive_with_autopilot(episode, graph)
     population = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
+    randomisation = recording.randomisation
+    population.bodies = randomisation.randomise_bodies(population.bodies, key)
     weather = draw_weather(key)
-    cameras = [rig_camera(channel, recording.width) for channel in RIG]
+    draws = {channel: randomisation.draw_camera((*key, channel)) for channel in RIG}
+    cameras = [draws[channel].camera(rig_camera(channel, recording.width)) for channel in RIG]
     samples: list[dict[str, Any]] = []
-    files = _PartWriter(folder, recording.quality)
+    files = _PartWriter(folder, {channel: draws[channel].quality(recording.quality) for channel in RIG})
     sweep_spacing = max(1, KEY // (recording.sweeps + 1))
     steps = [
         step
@@ -233,13 +260,14 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
         if step % KEY == 0 or (step % sweep_spacing == 0 and step % KEY <= sweep_spacing * recording.sweeps)
     ]
     # Most bodies of a town are never in view; building only the visible ones saves time and memory.
-    scene = RenderScene(
-        street, population.meshes.select(_meshes_near(population, trace, steps)), device=recording.device
-    )
+    meshes = [*population.meshes.select(_meshes_near(population, trace, steps)), *head_meshes()]
+    heads = SignalHeads(graph, street, len(population.meshes))
+    scene = RenderScene(street, meshes, device=recording.device)
     steps_per_call = GPU_STEPS if recording.device != "cpu" else 1
     for start in range(0, len(steps), steps_per_call):
         moments = [
-            _Moment.of(step, population, trace, cameras, weather, key) for step in steps[start : start + steps_per_call]
+            _Moment.of(step, population, heads, trace, (cameras, draws), weather, key)
+            for step in steps[start : start + steps_per_call]
         ]
         for moment, shares in _render_moments(scene, moments, files, number, batched=recording.device != "cpu"):
             sweep_end = moment.now
@@ -258,7 +286,7 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
             if moment.is_key_frame:
                 boxes = _annotate([placed for placed in surrounding if placed.body.kind], ego, points, shares)
                 samples.append({"time": moment_timestamp(number, sweep_end), "sweep": moment.step, "boxes": boxes})
-    part_page = {
+    part_page: dict[str, Any] = {
         "name": name,
         "town": town,
         "drive": episode.key,
@@ -267,6 +295,11 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
         "weather": describe_weather(weather),
         "sensors": _sensors(cameras),
     }
+    if randomisation:
+        part_page["randomised"] = {
+            "cameras": {channel: dict(draw.values) for channel, draw in draws.items()},
+            "vehicles": describe_bodies(population.bodies),
+        }
     parts.finish(name, part_page)
 
 
@@ -309,13 +342,15 @@ class _Moment:
     def of(  # noqa: PLR0917
         step: int,
         population: SceneObjects,
+        heads: SignalHeads,
         trace: EpisodeTrace,
-        cameras: list[Camera],
+        cameras_and_draws: tuple[list[Camera], Mapping[str, CameraDraw]],
         weather: SceneWeather,
         key: tuple[object, ...],
     ) -> _Moment:
         """Each camera at its own time; the first sweep ends when every camera has fired."""
         sweep_end = FIRST_SWEEP_END + step * trace.dt
+        cameras, draws = cameras_and_draws
         views, times, egos = [], [], []
         for camera_index, camera in enumerate(cameras):
             exposure_time = sweep_end - AHEAD[camera.channel]
@@ -326,7 +361,10 @@ class _Moment:
             )
             noise_seed = int(digest("noise", *key, step, camera_index)[:7], 16)
             lamps = own_lamps(ego, weather)
-            views.append(View(camera, ego @ camera.to_ego, scene_objects, weather, SENSOR, noise_seed, lamps))
+            scene_objects += heads.trace_lights(trace, exposure_time, ego[:2, 3])
+            draw = draws[camera.channel]
+            view_weather, sensor = draw.weather(weather), draw.sensor(SENSOR, camera)
+            views.append(View(camera, ego @ camera.to_ego, scene_objects, view_weather, sensor, noise_seed, lamps))
             times.append(exposure_time)
             egos.append(ego)
         return _Moment(step, sweep_end, views, times, egos)
@@ -382,10 +420,10 @@ def drive_with_autopilot(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
 
 @dataclass(slots=True)
 class _PartWriter:
-    """Files of a scene's part, and the rows that describe them."""
+    """Files of a scene's part, and the rows that describe them; quality of JPEG by channel."""
 
     folder: Path
-    quality: int
+    quality: Mapping[str, int]
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def write_image(
@@ -396,7 +434,7 @@ class _PartWriter:
         safeio.write_atomic(self.folder / f"{name}.depth.png", depth_bytes(depth))
         self._write(
             f"{name}.jpg",
-            encode_jpeg(image, self.quality, "420"),
+            encode_jpeg(image, self.quality[camera.channel], "420"),
             channel=camera.channel,
             time=moment,
             key=on_key,
@@ -448,7 +486,7 @@ def _annotate(
             annotation_rows.append(
                 {
                     "tag": placed_object.body.tag,
-                    "category": BODY_CATEGORIES[placed_object.body.kind],
+                    "category": category_of(placed_object.body.kind, placed_object.body.style),
                     "attributes": list(attributes_of(placed_object)),
                     "centre": centre[row].tolist(),
                     "size": size[row].tolist(),
@@ -565,3 +603,9 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     )
         for split, scene_names in splits.items():
             writer.set_split(split, scene_names)
+    if recording.randomisation:
+        page = {
+            "ranges": recording.randomisation.identity(),
+            "scenes": {name: recording.parts.page(name)["randomised"] for name in names},
+        }
+        safeio.write_atomic(out / recording.version / RANDOMISED, safeio.dump_json(page) + "\n")

@@ -35,11 +35,13 @@ from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import drive_street, make_drive
 from ssad.recorders.nuscenes import draw_weather, drive_with_autopilot
 from ssad.recorders.parts import TIME_LIMIT, is_same_request
+from ssad.recorders.randomisation import CameraDraw, Randomisation, describe_body
 from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, TargetRecording
 from ssad.recorders.viewpoints import (
     AIM,
     Place,
     Viewpoint,
+    between,
     following_viewpoints,
     has_free_sight,
     has_room,
@@ -65,6 +67,7 @@ from ssad.rendering.scene_objects import (
     occupy_standing,
     place_objects,
 )
+from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street_signs import free_places, plate_and_post
 from ssad.rendering.target import STANDING, TargetCar, TargetSign, TargetWalker, class_of_target
 from ssad.world.roads import load_town
@@ -75,9 +78,11 @@ MAX_DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes o
 PLACE_TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
 TARGETS: Final = 5  # bodies that an orbit shows in turn
 SECONDS: Final = 24.0  # of a drive
+APPROACH_SECONDS: Final = 48.0  # of a drive in which the target is seen from far
 TARGET: Final = 1_000_000  # its tag
 HIDDEN: Final = 0.25  # visible share below which an object is crowd, as one with a side below SMALL
 MIN_VISIBLE_SHARE: Final = 0.6  # least visible share of the target, and least share of it inside the picture
+STRAIGHT: Final = 0.95  # least distance of a target on an approach, as a share of the way to it
 MAX_NEAR_SHARE: Final = 0.2  # largest share of the picture that something right before the camera may cover
 
 
@@ -91,6 +96,7 @@ class _TargetDrive:
         trace: The drive.
         population: Bodies of the drive.
         scene: Street and bodies, ready to be rendered.
+        heads: Signals of the street.
         targets: Bodies that play the target in turn.
         places: Possible places of a standing target.
     """
@@ -100,16 +106,19 @@ class _TargetDrive:
     trace: EpisodeTrace
     population: SceneObjects
     scene: RenderScene
+    heads: SignalHeads
     targets: tuple[ObjectBody, ...]
     places: tuple[Place, ...] = ()
 
 
 def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
     graph = load_town(town)
+    seconds = APPROACH_SECONDS if recording.approach else SECONDS
     street = drive_street(graph, recording.streets, key=("clips", *key))
-    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=seconds), graph)
     population = place_objects(trace, graph, street, key=key, many_signs=recording.streets == "any")
     places: tuple[Place, ...] = ()
+    randomisation = recording.randomisation
     if isinstance(recording.target, TargetSign):
         targets: tuple[ObjectBody, ...] = (_add_target_sign(population, recording.target),)
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
@@ -124,15 +133,32 @@ def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> 
         targets = tuple(
             _draw_target(population, generator("clips target", *key, index)) for index in range(target_count)
         )
+    population.bodies = randomisation.randomise_bodies(population.bodies, key)
+    # A target that was asked for keeps its paint.
+    has_paint = recording.target is None
+    targets = tuple(
+        randomisation.randomise_body(target, (*key, "target", index), has_paint=has_paint)
+        for index, target in enumerate(targets)
+    )
     return _TargetDrive(
         recording,
         key,
         trace,
         population,
-        RenderScene(street, population.meshes, device=recording.device),
+        RenderScene(street, [*population.meshes, *head_meshes()], device=recording.device),
+        SignalHeads(graph, street, len(population.meshes)),
         targets,
         places,
     )
+
+
+def _surrounding(stage_set: _TargetDrive, viewpoint: Viewpoint) -> list[PlacedObject]:
+    """Objects around the camera; on an approach without those between it and the target."""
+    placed_objects = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+    if not stage_set.recording.approach:
+        return placed_objects
+    is_between = between(stage_set.targets[0], viewpoint, placed_objects)
+    return [placed for placed, is_hiding in zip(placed_objects, is_between, strict=True) if not is_hiding]
 
 
 def _draw_target(population: SceneObjects, rng: np.random.Generator) -> ObjectBody:
@@ -178,6 +204,9 @@ def _viewpoint_rounds(
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
     recording, key = stage_set.recording, stage_set.key
     rng = generator("clips shots", *key)
+    if recording.approach:
+        yield from _approaching_rounds(stage_set, town, slots, missing, rng)
+        return
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
         remaining = iter(
@@ -219,6 +248,46 @@ def _viewpoint_rounds(
         yield sorted(first_free.items())
 
 
+def _approaching_rounds(
+    stage_set: _TargetDrive, town: str, slots: range, missing: Callable[[], list[int]], rng: np.random.Generator
+) -> Iterator[list[tuple[int, Viewpoint]]]:
+    """Again and again shots for what is missing, each from its own distance, until this drive has no more."""
+    recording = stage_set.recording
+    weather = draw_weather(("clips", *stage_set.key))
+    distance_indices = shuffled_cells(slots, len(recording.approach), key=(recording.seed, town))
+    remaining: dict[int, Iterator[Viewpoint]] = {}
+    for index, distance in enumerate(recording.approach):
+        viewpoints = following_viewpoints(
+            stage_set.trace,
+            weather,
+            behind=distance,
+            height=recording.height,
+            count=distance_indices.count(index),
+            rng=rng,
+        )
+        remaining[index] = _visible_viewpoints(stage_set, viewpoints, distance)
+    while True:
+        batch = []
+        for slot in missing():
+            viewpoint = next(remaining[distance_indices[slot]], None)
+            if viewpoint is not None:
+                batch.append((slot, viewpoint))
+        if not batch:
+            return
+        yield batch
+
+
+def _visible_viewpoints(
+    stage_set: _TargetDrive, viewpoints: Sequence[Viewpoint], distance: float
+) -> Iterator[Viewpoint]:
+    """Those viewpoints of an approach from which the street does not hide the target, described by their distance."""
+    for viewpoint in viewpoints:
+        if viewpoint.description["distance"] < STRAIGHT * distance:
+            continue  # behind a bend
+        if has_free_sight(stage_set.scene, [viewpoint], batch=1, height=2 * AIM)[0]:
+            yield replace(viewpoint, description=viewpoint.description | {"distance": distance})
+
+
 def _record_part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     """Record `count` images, of one drive if possible, and return the name of the part.
 
@@ -246,7 +315,8 @@ def _record_part(task: tuple[TargetRecording, str, int, int, str]) -> str:
         for viewpoints in _viewpoint_rounds(stage_set, town, slots, attempt, missing):
             for image_index, row, image in _accept_views(stage_set, viewpoints, skipped):
                 file = f"{name}-{image_index:03d}.jpg"
-                safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, recording.quality, "420"))
+                quality = _draw_camera(stage_set, image_index).quality(recording.quality)
+                safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, quality, "420"))
                 base_row = {
                     "file_name": file,
                     "town": town,
@@ -274,15 +344,18 @@ def _accept_views(
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
     recording = stage_set.recording
-    camera = _camera(recording.size)
     candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for slot, viewpoint in shots:
         target = stage_set.targets[slot % len(stage_set.targets)]
-        surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        surrounding = _surrounding(stage_set, viewpoint)
         if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
-        view = _view(stage_set, slot, viewpoint, surrounding, camera)
+        draw = _draw_camera(stage_set, slot)
+        # Orbits ask for places of the camera; only its pitch may change them.
+        pose = draw.pose(viewpoint.camera, raised=recording.mode == "drive")
+        viewpoint = replace(viewpoint, camera=pose, weather=draw.weather(viewpoint.weather))  # noqa: PLW2901
+        view = _view(stage_set, slot, viewpoint, surrounding, draw)
         surrounding.append(PlacedObject(target, viewpoint.target, 0.0, view.objects[0]))
         candidates.append((slot, viewpoint, view, surrounding))
     batch = batch_size(recording.device)
@@ -300,14 +373,21 @@ def _accept_views(
                 "time": viewpoint.time,
                 "weather": weather_name(viewpoint.weather),
                 "light": asdict(viewpoint.weather),
-                "intrinsic": camera.intrinsic.tolist(),
+                "intrinsic": view.camera.intrinsic.tolist(),
                 "pose": viewpoint.camera.tolist(),
                 "target_pose": viewpoint.target.tolist(),
                 "target_style": target.style,
                 "target_size": [round(extent, 3) for extent in target.size],
                 "objects": objects,
             }
+            if recording.randomisation:
+                row["randomised"] = dict(_draw_camera(stage_set, slot).values) | {"target": describe_body(target)}
             yield slot, row | viewpoint.description, rendering.image[index]
+
+
+def _draw_camera(stage_set: _TargetDrive, slot: int) -> CameraDraw:
+    """Draw the camera of an image."""
+    return stage_set.recording.randomisation.draw_camera((*stage_set.key, slot))
 
 
 def label_of(kind: str) -> int | None:
@@ -329,17 +409,28 @@ def _camera(size: int) -> Camera:
 
 
 def _view(
-    stage_set: _TargetDrive, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
+    stage_set: _TargetDrive, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], draw: CameraDraw
 ) -> View:
     """View `n` of a part: the target first, then who else is there."""
     target = stage_set.targets[n % len(stage_set.targets)]
-    target_object = SceneObject(target.meshes[0], viewpoint.target, target.paint, TARGET)
+    camera = draw.camera(_camera(stage_set.recording.size))
+    target_object = SceneObject(target.meshes[0], viewpoint.target, target.paint, TARGET, finish=target.finish)
     noise_seed = int(digest("clips noise", *stage_set.key, n)[:7], 16)
     lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.recording.mode == "drive" else ()
     focus_point = float(viewpoint.target[0, 3]), float(viewpoint.target[1, 3])
     other_parts = (SceneObject(mesh, viewpoint.target, target.paint) for mesh in target.meshes[1:])
-    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects))
-    return View(camera, viewpoint.camera, scene_objects, viewpoint.weather, SENSOR, noise_seed, lamps, focus_point)
+    lights = stage_set.heads.trace_lights(stage_set.trace, viewpoint.time, viewpoint.camera[:2, 3])
+    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects), *lights)
+    return View(
+        camera,
+        viewpoint.camera,
+        scene_objects,
+        viewpoint.weather,
+        draw.sensor(SENSOR, camera),
+        noise_seed,
+        lamps,
+        focus_point,
+    )
 
 
 def _follower(viewpoint: Viewpoint) -> F64:
@@ -608,8 +699,8 @@ def recorded_views(
             target_pose = np.array(row["target_pose"])
             weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
-            surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
-            view = _view(stage_set, row["slot"], viewpoint, surrounding, _camera(recording.size))
+            surrounding = _surrounding(stage_set, viewpoint)
+            view = _view(stage_set, row["slot"], viewpoint, surrounding, _draw_camera(stage_set, row["slot"]))
             yield RecordedView(row["file_name"], row, stage_set.scene, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
@@ -627,6 +718,7 @@ def _recording_from_description(description: Mapping[str, Any], folder: Path, de
         for name, value in description.items()
         if name != "clips"
     }
+    settings["randomisation"] = Randomisation.of(settings.get("randomisation", {}))
     settings["images"] = tuple((town, count) for town, count in description["images"])
     if description["target"] is not None:
         size = description["target"]["size"]

@@ -14,6 +14,7 @@ from ssad.core.wording import counted
 from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
 from ssad.recorders.parts import PartsFolder
+from ssad.recorders.randomisation import NO_RANDOMISATION, Randomisation
 from ssad.rendering.target import Target, TargetSign, TargetWalker
 from ssad.world.roads import is_town
 
@@ -25,6 +26,7 @@ BEHIND: Final = 75.0  # degrees from the front of a sign from which its face is 
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 FOCAL: Final = 1.1  # focal length in widths of the picture: 49 degrees across
 SMALL: Final = 8.0  # px of a side of a target
+MAX_DISTANCE: Final = 80.0  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,8 @@ class TargetRecording:
         device: Device that renders.
         streets: See `drive_street`.
         weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
+        randomisation: What is drawn for each image and for each vehicle of a drive.
+        approach: Distances of the following camera in place of `behind`, m of way, in turn; empty: `behind` alone.
 
     Raises:
         ConfigError: A value is out of range, or the values do not fit together.
@@ -67,6 +71,8 @@ class TargetRecording:
     device: str = "cpu"
     streets: str = "town"
     weathers: tuple[str, ...] = ()
+    randomisation: Randomisation = NO_RANDOMISATION
+    approach: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for town in (*(name for name, _ in self.images), *self.held_out):
@@ -92,10 +98,10 @@ class TargetRecording:
             raise ConfigError(f"a {complaint}: record it with --clips orbit")
         if not self.distances:
             raise ConfigError("an orbit needs distances")
-        if not all(3.0 <= distance <= 80.0 for distance in self.distances) or not all(
+        if not all(3.0 <= distance <= MAX_DISTANCE for distance in self.distances) or not all(
             0.0 <= elevation <= 75.0 for elevation in self.elevations
         ):
-            raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
+            raise ConfigError(f"distances: 3 to {MAX_DISTANCE:g} m; elevations: 0 to 75 degrees")
         for weather in self.weathers:
             if weather not in WEATHERS:
                 raise unknown_name("weather", weather, WEATHERS)
@@ -107,7 +113,11 @@ class TargetRecording:
             raise ConfigError(f"azimuths of a sign: less than {BEHIND:g} degrees to either side of its front")
         if is_sign and self.elevations != (0.0,):
             raise ConfigError("a sign is seen from the heights of cars: give no elevations")
-        max_distance = self.behind if self.mode == "drive" else max(self.distances)
+        if self.approach and self.mode != "drive":
+            raise ConfigError("approach is for a camera that follows; an orbit has distances")
+        if not all(3.0 <= distance <= MAX_DISTANCE for distance in self.approach):
+            raise ConfigError(f"approach: 3 to {MAX_DISTANCE:g} m")
+        max_distance = max(self.approach or (self.behind,)) if self.mode == "drive" else max(self.distances)
         target_kind = "sign" if is_sign else "walker" if is_walker else "car"
         # The smallest side of the farthest target must still span MIN_BOX_SIDE pixels.
         if not FOCAL * self.size * TALL[target_kind] / max_distance >= SMALL or self.size > 4096:
@@ -127,14 +137,27 @@ class TargetRecording:
         settings = asdict(replace(self, out=Path())) | {
             "clips": self.mode,
             "images": [list(pair) for pair in self.images],
+            "randomisation": self.randomisation.identity(),
         }
-        # An empty value is left out, so that recordings without weathers keep their identity.
-        excluded = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
+        # Empty values are left out, so that recordings without them keep their identity.
+        optional = ("weathers", "randomisation", "approach")
+        excluded = {"out", "mode"} | {name for name in optional if not settings[name]}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in settings.items()
             if name not in excluded
         }
+
+
+def height_in_pixels(metres: float, distance: float, size: int) -> float:
+    """Return the height in the image of something upright, px, seen level by a pinhole camera.
+
+    Args:
+        metres: Its height, m.
+        distance: Distance from the camera, m.
+        size: Side of the image, px, of which the focal length is `FOCAL` times.
+    """
+    return FOCAL * size * metres / distance
 
 
 def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:

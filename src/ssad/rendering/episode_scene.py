@@ -7,7 +7,7 @@ The result does not depend on the other episodes that share a scene.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
@@ -16,28 +16,21 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose, upright_poses
 from ssad.core.seeding import generator
-from ssad.core.types import F32, F64, I32, U8, Body, Bool, Episode, EpisodeTrace, SignalState
+from ssad.core.types import F32, F64, I32, U8, Body, Bool, Episode, EpisodeTrace
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.rendering.camera.scene import RenderScene, SceneObject
-from ssad.rendering.meshes.mesh import Material, Mesh, merge, prism
+from ssad.rendering.meshes.mesh import Mesh, merge
 from ssad.rendering.scene_objects import PHASES, STRIDE, GroundOccupancy
+from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import KINDS, REACH, street_signs
+from ssad.rendering.vehicle_signals import flashing, trace_signals
 from ssad.world.models import agent_model, agent_size, stated_size, trace_sizes
 from ssad.world.rollout import route_signals
 
 VARIANTS: Final = 4  # bodies that play a model
 CYCLED: Final = ("pedestrian", "bicycle")  # kinds of body that have a walking cycle, or pedals
-LENS: Final = 0.11  # m, radius of a signal's lens
-LENSES: Final = {SignalState.RED: 0.31, SignalState.YELLOW: 0.0, SignalState.GREEN: -0.31}  # m above a head's middle
-LIGHTS: Final = {
-    SignalState.RED: (1.0, 0.04, 0.02),
-    SignalState.YELLOW: (1.0, 0.45, 0.02),
-    SignalState.GREEN: (0.03, 1.0, 0.45),
-}
-BRIGHT: Final = 1.3  # emission of a lit lens
-SIGNALS_WITHIN: Final = 150.0  # m from the eye
 
 BodyKey = tuple[str, int, int, tuple[float, ...]]
 """Model, which of its `VARIANTS`, which of the `PHASES` of its cycle, and its size if that is not the model's."""
@@ -67,14 +60,6 @@ def body_of(model: str, variant: int, phase: int = 0, size: tuple[float, ...] = 
     )
 
 
-@lru_cache(maxsize=3)
-def _lens(state: SignalState) -> Mesh:
-    """Return a lit lens that faces along x."""
-    angles = np.arange(10) * (2 * np.pi / 10)
-    outline = LENS * np.stack([np.cos(angles), np.sin(angles)], -1)
-    return prism(outline, (0.0, 0.01), material=Material("signal_light", LIGHTS[state], emission=BRIGHT), axis=0)
-
-
 @dataclass(frozen=True, slots=True)
 class Appearance:
     """Time-invariant appearance of an episode.
@@ -88,6 +73,7 @@ class Appearance:
         strides: Phase of each agent's walking cycle at the start, m.
         signals: Lit signals of the town's lane graph: those of the junctions on the ego's route.
         signs: Numbers of the town's signs near the route.
+        route: Points of the ego's route [N, 2], m.
     """
 
     key: str
@@ -98,6 +84,7 @@ class Appearance:
     strides: F64
     signals: I32
     signs: tuple[int, ...]
+    route: F64 = field(default_factory=lambda: np.zeros((0, 2)))
 
     def bodies(self) -> set[BodyKey]:
         """Return the keys of the bodies that the agents need, in all phases of their cycles."""
@@ -118,6 +105,7 @@ class AgentPoses:
         active: [A] whether the agent is present.
         walked: [A] distance covered so far, m.
         signal: [S'] `SignalState` of the lit signals.
+        lamps: [A] `LampSignal` bits of the agents' stop lamps and indicators at this moment; None: none shines.
     """
 
     step: int
@@ -125,6 +113,7 @@ class AgentPoses:
     active: Bool
     walked: F64
     signal: U8
+    lamps: I32 | None = None
 
 
 def walked_distance(distance: F64, previous_pose: F32, pose: F32) -> F64:
@@ -158,21 +147,12 @@ class EpisodeScene:
             street_signs(graph, sign_positions, GroundOccupancy(street), key=(graph.name,), many=False, detail=1)
         )
         self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
+        self.sign_kinds = {index: sign.kind for index, sign in enumerate(signs)}
         self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
         # Signs and lenses come first: their numbers must not change when bodies are added.
-        self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + [_lens(state) for state in LENSES]
-        heads = street.heads.astype(np.float64)
-        self._head_places = heads[:, :2]
-        self._lenses = [
-            {
-                # 1 cm in front of the head, so that the lens is not hidden in its surface.
-                state: SceneObject(
-                    len(signs) + index, upright_pose(x, y, yaw, z + offset) @ upright_pose(0.01, 0.0, 0.0)
-                )
-                for index, (state, offset) in enumerate(LENSES.items())
-            }
-            for x, y, z, yaw in heads.tolist()
-        ]
+        self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + list(head_meshes())
+        self.heads = street.heads.astype(np.float64)
+        self._signal_heads = SignalHeads(graph, street, len(signs))
         self._bodies: dict[object, int] = {}
         self._meshes: dict[object, Mesh] = {}
         self._scene: RenderScene | None = None
@@ -192,6 +172,10 @@ class EpisodeScene:
             self._bodies |= {key: first_index + index for index, key in enumerate(meshes)}
             self._meshes |= meshes
             self._scene = None
+
+    def indices(self, keys: Iterable[object]) -> dict[object, int]:
+        """Return the number of each mesh in the scene."""
+        return {key: self._bodies[key] for key in keys}
 
     def index(self, key: object) -> int:
         """Return the number of a mesh in the scene."""
@@ -242,6 +226,7 @@ class EpisodeScene:
             strides,
             signals,
             tuple(near_signs),
+            way.astype(np.float64),
         )
 
     def objects(
@@ -256,37 +241,34 @@ class EpisodeScene:
         """
         visible = [SceneObject(sign_index, self._sign_poses[sign_index]) for sign_index in appearance.signs]
         poses = upright_poses(agent_poses.pose.astype(np.float64))
+        lamps = [0] * len(poses) if agent_poses.lamps is None else agent_poses.lamps.tolist()
         for agent, model in enumerate(appearance.models):
             if agent_poses.active[agent] and agent != without:
                 phase = 0
                 if _cycles(model):
                     phase = int((agent_poses.walked[agent] + appearance.strides[agent]) / STRIDE * PHASES) % PHASES
                 body_index = self._bodies[model, appearance.variants[agent], phase, appearance.sizes[agent]]
-                visible.append(SceneObject(body_index, poses[agent], appearance.paints[agent], agent + 1))
+                visible.append(
+                    SceneObject(body_index, poses[agent], appearance.paints[agent], agent + 1, signals=lamps[agent])
+                )
         return tuple(visible)
 
     def lights(self, appearance: Appearance, poses: AgentPoses, viewpoint: F64) -> tuple[SceneObject, ...]:
-        """The lit lenses of the signals near a place [2]; they belong to the street."""
+        """Return the objects that show the states of the signals near a place [2]; they belong to the street."""
         signal_states = dict(zip(appearance.signals.tolist(), poses.signal.tolist(), strict=True))
-        head_offsets = self._head_places - viewpoint
-        near_heads = np.flatnonzero(np.hypot(head_offsets[:, 0], head_offsets[:, 1]) < SIGNALS_WITHIN).tolist()
-        head_states = (
-            (head_index, SignalState(signal_states.get(signal, SignalState.OFF)))
-            for head_index, signal in zip(near_heads, self.street.head_signal[near_heads].tolist(), strict=True)
-        )
-        return tuple(
-            self._lenses[head_index][lens_state] for head_index, lens_state in head_states if lens_state in LENSES
-        )
+        return self._signal_heads.lights(signal_states, viewpoint)
 
 
 def agent_poses(trace: EpisodeTrace) -> list[AgentPoses]:
-    """Return the poses of all agents at each step of a trace."""
+    """Return the poses of all agents at each step of a trace, with the signals of vehicles."""
     pose = np.stack([trace.x, trace.y, trace.yaw], -1)
+    agents, signals = np.arange(len(trace.models)), trace_signals(trace)
     walked = np.zeros(pose.shape[1])
     moments = []
     for step in range(len(pose)):
         walked = walked_distance(walked, pose[max(step - 1, 0)], pose[step])
-        moments.append(AgentPoses(step, pose[step], trace.active[step], walked, trace.signal[step]))
+        lamps = flashing(signals[step], step * trace.dt, agents)
+        moments.append(AgentPoses(step, pose[step], trace.active[step], walked, trace.signal[step], lamps))
     return moments
 
 

@@ -22,46 +22,57 @@ from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest
-from ssad.core.types import F32, F64, I32, U8, AgentKind, End, EpisodeTrace
+from ssad.core.types import F32, F64, I32, U8, End, EpisodeTrace
 from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
+from ssad.rendering.camera.render import Rendering, RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit, render_with
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.sensor import SensorModel as Response
-from ssad.rendering.episode_scene import AgentPoses, Appearance, EpisodeScene, agent_poses, walked_distance
+from ssad.rendering.episode_scene import (
+    AgentPoses,
+    Appearance,
+    EpisodeScene,
+    agent_poses,
+    walked_distance,
+)
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
+from ssad.rendering.street_edit import StreetEdit
+from ssad.rendering.vehicle_signals import WITH_LAMPS, flashing, vehicle_signals, with_lamps
 from ssad.world.models import MODELS, agent_size
+from ssad.world.rollout import has_drivers
 
 DAY: Final = SceneWeather(0.9, 2.2, 0.3)
 AT_ONCE, AT_ONCE_GPU, AT_LEAST_GPU = 1, 192, 16  # views rendered in one call; on a CPU more do not pay
 VIEW_MEMORY: Final = 100 << 20  # bytes that a view of 640 x 360 needs on a GPU, with shadows and textures
-WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
 
 
 @dataclass(slots=True)
 class _Track:
-    """Poses of the agents of a scene since its episode began, one entry per step."""
+    """Poses, speeds and distances of the agents of a scene since its episode began, one entry per step."""
 
     episode: int
     appearance: Appearance
     pose: list[F32] = field(default_factory=list)
     walked: list[F64] = field(default_factory=list)
+    speed: list[F32] = field(default_factory=list)
 
-    def follow(self, step: int, pose: F32) -> None:
+    def follow(self, step: int, pose: F32, speed: F32) -> None:
         """Append a step; an earlier step discards the entries from there on."""
         if step < len(self.pose):
             if np.array_equal(self.pose[step], pose):
                 return
-            del self.pose[step:], self.walked[step:]
+            del self.pose[step:], self.walked[step:], self.speed[step:]
         previous_pose = self.pose[-1] if self.pose else pose
         walked = self.walked[-1] if self.walked else np.zeros(len(pose))
-        # steps before the first reading are unknown; they only affect the phase of walking cycles
+        # steps before the first reading are unknown; they only affect walking cycles and stop lamps
         missing_steps = step + 1 - len(self.pose)
         self.pose += [pose.copy()] * missing_steps
         self.walked += [walked_distance(walked, previous_pose, pose)] * missing_steps
+        self.speed += [speed.copy()] * missing_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +112,11 @@ class Onboard:
         device: Device that renders: cpu or cuda:0.
         attack: Edit of one of the agents, or of stop signs, that cameras and LiDARs see.
         resident: Whether images stay on a GPU, as torch tensors, for a driver that processes them there.
+        effects: Effects of the rendering that cameras show, see `ssad.rendering.camera.effects`.
+        street_edit: Edit of the street that cameras and LiDARs see; not together with `attack`.
+
+    Raises:
+        ConfigError: There are both an attack and an edit of the street.
     """
 
     def __init__(
@@ -111,13 +127,19 @@ class Onboard:
         device: str = "cpu",
         attack: AgentEdit | None = None,
         resident: bool = False,
+        effects: frozenset[str] = DEFAULT_EFFECTS,
+        street_edit: StreetEdit | None = None,
     ) -> None:
+        self.quality = RenderQuality(effects=effects)
         self.resident = resident and device != "cpu"
         self.at_once = AT_ONCE
         if device != "cpu":
             # other processes may share the device
             self.at_once = max(min(AT_ONCE_GPU, wp.get_device(device).free_memory // 4 // VIEW_MEMORY), AT_LEAST_GPU)
         self.weather, self.response, self.device, self.attack = weather, response, device, attack
+        if attack is not None and street_edit is not None:
+            raise ConfigError("an agent and the street are edited at once; use one attack at a time")
+        self.street_edit = street_edit
         self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
         self._simulator: Simulator | None = None
         self._tracks: dict[int, _Track] = {}
@@ -183,7 +205,8 @@ class Onboard:
                 episode_spec = simulator.episodes[episode]
                 appearance = self.town(simulator.graphs[episode_spec.town]).appearance(episode_spec)
                 history = self._tracks[scene] = _Track(episode, appearance)
-            history.follow(step, state.pose[scene, : len(history.appearance.models)])
+            agent_count = len(history.appearance.models)
+            history.follow(step, state.pose[scene, :agent_count], state.speed[scene, :agent_count])
         return state
 
     def town(self, graph: LaneGraph) -> EpisodeScene:
@@ -205,10 +228,15 @@ class Onboard:
         town.add_bodies(appearance.bodies())
         if self.attack is not None:
             town.add_meshes(self.attack.meshes(*self._attacked(appearance)))
+        if self.street_edit is not None:
+            town.add_meshes(self.street_edit.meshes())
 
     def visible_objects(self, sight: AgentView) -> tuple[SceneObject, ...]:
         """The bodies that an agent could see."""
         scene_objects = sight.town.objects(sight.appearance, sight.moment, without=sight.agent)
+        if self.street_edit is not None:
+            indices = sight.town.indices(self.street_edit.meshes())
+            return self.street_edit.objects(scene_objects, sight.appearance.route, indices, sight.town.sign_kinds)
         if self.attack is None:
             return scene_objects
         (target_key, *_) = self.attack.meshes(*self._attacked(sight.appearance))
@@ -220,8 +248,8 @@ class Onboard:
         views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
         edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
-            return render(scene, views, download=False)
-        rendering = render_with(scene, views, edit.textures, edit.masks)
+            return render(scene, views, quality=self.quality, download=False)
+        rendering = render_with(scene, views, edit.textures, edit.masks, quality=self.quality)
         image, tag, depth = (
             wp.array(array, device=self.device) for array in (rendering.image, rendering.tag, rendering.depth)
         )
@@ -229,6 +257,8 @@ class Onboard:
 
     def edit(self, sight: AgentView) -> SceneEdit | None:
         """Return the edit of an episode, the same for all episodes whose attacked agent is of one model."""
+        if self.street_edit is not None:
+            return self.street_edit.edit if self.street_edit.edit.textures else None
         return None if self.attack is None else self.attack.body(*self._attacked(sight.appearance))[1]
 
     def _attacked(self, appearance: Appearance) -> tuple[str, tuple[float, ...]]:
@@ -248,8 +278,19 @@ class Onboard:
             if scene not in moments:
                 step, agent_count = _step_of(simulator, state, scene), len(history.appearance.models)
                 signal = state.signal[scene][history.appearance.signals]
+                # As in the trace, which keeps turn signals only of episodes with drivers of the population.
+                shows_turns = has_drivers(simulator.episodes[history.episode])
+                signals = vehicle_signals(
+                    history.speed[max(step - 1, 0)],
+                    history.speed[step],
+                    history.walked[step],
+                    state.turn_signal[scene, :agent_count] if shows_turns else np.zeros(agent_count, np.int8),
+                    simulator.dt,
+                    with_lamps(history.appearance.models),
+                )
+                lamps = flashing(signals, step * simulator.dt, np.arange(agent_count))
                 moments[scene] = AgentPoses(
-                    step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal
+                    step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal, lamps
                 )
             town = self.town(simulator.graphs[simulator.episodes[history.episode].town])
             agent_views.append(AgentView(row, town, history.appearance, moments[scene], agent))
@@ -301,6 +342,8 @@ class Onboard:
         # The noise depends on nothing else, so a trace reproduces the reading to the bit.
         noise_seed = int(digest("onboard noise", appearance.key, moment.step, agent, camera.channel)[:7], 16)
         view = View(camera, camera_pose, (*scene_objects, *lit_lenses), weather, self.response, noise_seed, lamps)
+        if self.street_edit is not None:
+            return self.street_edit.on(view, appearance.route, sight.town.heads)
         edit = self.edit(sight)
         if edit is None or self.attack is None:
             return view

@@ -15,13 +15,14 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
+from ssad.core.types import F64, U8, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
-from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
-from ssad.rendering.camera.scene import SceneObject
+from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, TowingVehicle, plain_body, towing_vehicle
+from ssad.rendering.camera.scene import Finish, SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
+from ssad.rendering.vehicle_signals import flashing, trace_signals
 from ssad.world.models import SURROGATES, stated_size, trace_sizes
 
 Size = tuple[float, float, float]  # length, width, height
@@ -70,6 +71,7 @@ NOTHING = Mesh(
     np.zeros(0, np.int32),
     (),
 )
+TRAILER_GAP = 0.9  # m of the kerb that a trailer and the vehicle before it leave free
 LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
@@ -100,6 +102,8 @@ class ObjectBody:
         active: [T] whether it is present.
         is_driven: [T] distance covered so far, m.
         is_parked: Whether it is a vehicle without a driver.
+        signals: [T] `LampSignal` bits of its stop lamps and indicators, or [1] if they never shine.
+        finish: Metallic paint, dirt and wear; None for a clean body.
     """
 
     tag: int
@@ -112,6 +116,8 @@ class ObjectBody:
     active: Bool
     is_driven: F64
     is_parked: bool = False
+    signals: U8 = field(default_factory=lambda: np.zeros(1, np.uint8))
+    finish: Finish | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,11 +219,17 @@ class SceneObjects:
             )
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            placed.append(
-                PlacedObject(
-                    body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked)
-                )
+            signals = int(flashing(body.signals[min(lower_step, len(body.signals) - 1)], time, body.tag))
+            scene_object = SceneObject(
+                mesh,
+                pose,
+                body.paint,
+                body.tag,
+                is_lit=not body.is_parked,
+                signals=signals,
+                finish=body.finish,
             )
+            placed.append(PlacedObject(body, pose, speed, scene_object))
         return placed
 
     def add(
@@ -227,6 +239,7 @@ class SceneObjects:
         *,
         active: Bool | None = None,
         parked: bool = False,
+        signals: U8 | None = None,
     ) -> None:
         """Add a body (kind, style, size, meshes) with its track; its paint is drawn."""
         tag = len(self.bodies) + 1
@@ -238,15 +251,23 @@ class SceneObjects:
         activity = np.ones(len(track), bool) if active is None else active
         paint = draw_paint(generator("paint", *self.key, tag))
         kind, style, size, meshes = body_parts
-        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked))
+        shown = np.zeros(1, np.uint8) if signals is None else signals
+        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked, shown))
 
     def make(
-        self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
+        self,
+        kind: str,
+        style: str,
+        size: Size,
+        *,
+        name: tuple[object, ...] = (),
+        phases: int = 1,
+        has_driver: bool = True,
     ) -> tuple[str, str, Size, tuple[int, ...]]:
         """Add the meshes of one body in `phases` phases of its cycle; return its description for `add`."""
         key = (*self.key, *(name or (len(self.meshes),)))
 
-        build = partial(_drawn_mesh, make_body, key, kind, style, size, self.detail)
+        build = partial(_drawn_mesh, make_body, key, kind, style, size, self.detail, has_driver)
         cycle_phases = [2 * np.pi * index / phases if phases > 1 else None for index in range(phases)]
         return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle_phases)
 
@@ -259,10 +280,13 @@ def _drawn_mesh(  # noqa: PLR0917
     style: str,
     size: Size,
     detail: int,
+    has_driver: bool,
     phase: float | None,
 ) -> Mesh:
     # A recording is rendered clean and under each of its perturbations, an episode for each of its drivers.
-    return make(kind, style=style, size=size, generator=generator("record mesh", *key), detail=detail, phase=phase)
+    random_draws = generator("record mesh", *key)
+    options = {"generator": random_draws, "detail": detail, "phase": phase, "has_driver": has_driver}
+    return make(kind, style=style, size=size, **options)
 
 
 class GroundOccupancy:
@@ -344,6 +368,7 @@ def place_objects(
 def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
     """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
     sizes = trace_sizes(trace)
+    signals = trace_signals(trace)
     for agent in range(1, len(trace.models)):
         rng = generator("record body", *population.key, agent)
         track = np.stack([trace.x[:, agent], trace.y[:, agent], trace.yaw[:, agent], 0 * trace.x[:, agent]], -1).astype(
@@ -360,7 +385,7 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         kind, styles = ACTOR_BODIES[trace.models[agent]]
         style = styles[int(rng.integers(len(styles)))]
         if kind == "bus" and rng.random() < 0.45 and not is_exact:
-            _add_tractor(population, track, active, rng)
+            _add_tractor(population, track, active, signals[:, agent], rng)
             continue
         if kind == "truck" and rng.random() < 0.3:
             kind, style = "construction", draw_style("construction", generator=rng)
@@ -370,10 +395,14 @@ def _add_agents(population: SceneObjects, trace: EpisodeTrace) -> None:
         if is_exact:
             size = model_size
         phases = PHASES if kind in ("pedestrian", "bicycle") else 1
-        population.add(population.make(kind, style, size, phases=phases), track, active=active)
+        population.add(
+            population.make(kind, style, size, phases=phases), track, active=active, signals=signals[:, agent]
+        )
 
 
-def _add_tractor(population: SceneObjects, track: F64, active: Bool, random_draws: np.random.Generator) -> None:
+def _add_tractor(
+    population: SceneObjects, track: F64, active: Bool, signals: U8, random_draws: np.random.Generator
+) -> None:
     """A tractor on the front half of the agent, a trailer that follows its hitch."""
     height = float(random_draws.uniform(3.2, 3.8))
     sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(random_draws.uniform(3.3, 3.9))))
@@ -393,8 +422,8 @@ def _add_tractor(population: SceneObjects, track: F64, active: Bool, random_draw
             trailer_yaw,
         )
     style = ("box", "tank", "flatbed")[int(random_draws.integers(3))]
-    population.add(population.make("truck", "tractor", sizes[0]), tractor_track, active=active)
-    population.add(population.make("trailer", style, sizes[1]), trailer_track, active=active)
+    population.add(population.make("truck", "tractor", sizes[0]), tractor_track, active=active, signals=signals)
+    population.add(population.make("trailer", style, sizes[1]), trailer_track, active=active, signals=signals)
 
 
 def _fixed_track(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
@@ -449,14 +478,39 @@ def _add_parked_vehicles(  # noqa: PLR0917
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
         lateral_offset = size[1] / 2 + 0.08 if spot_index >= len(parking_lots) else 0.0
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
-        if not clear.is_free(x, y, yaw, PARKED[body_kind][1], size[1]):
+        towing = towing_vehicle(style, size) if body_kind == "trailer" else None
+        room = PARKED[body_kind][1] if towing is None else towing.length + TRAILER_GAP
+        if not clear.is_free(x, y, yaw, room, size[1]):
             continue
-        clear.occupy(x, y, yaw, PARKED[body_kind][1], size[1])
+        clear.occupy(x, y, yaw, room, size[1])
+        if towing is not None:
+            _add_parked_trailer(population, (x, y, yaw, z), style, size, towing)
+            continue
         wrong_way_share = 0.5 if spot_index < len(parking_lots) else AGAINST.get(body_kind, 0.0)
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
-        population.add(population.make(body_kind, style, size), _fixed_track(x, y, facing, z), parked=True)
+        parked_body = population.make(body_kind, style, size, has_driver=False)
+        population.add(parked_body, _fixed_track(x, y, facing, z), parked=True)
         if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
             _add_building_site(population, (x, y, yaw, z), size, prop_rng, clear)
+
+
+def _add_parked_trailer(
+    population: SceneObjects,
+    centre: tuple[float, float, float, float],
+    style: str,
+    size: Size,
+    towing: TowingVehicle,
+) -> None:
+    """Add a trailer with the vehicle before it; both together stand about a place (x, y, yaw, z)."""
+    x, y, yaw, z = centre
+    trailer_offset = 0.5 * (size[0] - towing.length)
+    bodies = (
+        (towing.kind, towing.style, towing.size, trailer_offset + towing.ahead),
+        ("trailer", style, size, trailer_offset),
+    )
+    for kind, body_style, body_size, along in bodies:
+        track = _fixed_track(x + along * np.cos(yaw), y + along * np.sin(yaw), yaw, z)
+        population.add(population.make(kind, body_style, body_size, has_driver=False), track, parked=True)
 
 
 def _add_building_site(

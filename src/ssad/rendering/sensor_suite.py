@@ -14,6 +14,7 @@ from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.lidar import Lidar
 from ssad.rendering.onboard import DAY, Onboard
 from ssad.rendering.radar import OnboardRadar
+from ssad.rendering.street_edit import StreetEdit
 
 CameraSensor = Callable[[Onboard, Camera], Sensor]
 """Makes the sensor of a camera, such as one whose images are under a shift."""
@@ -33,6 +34,7 @@ class SensorSuite:
         device: Device that renders: cpu or cuda:0.
         weather: Weather of all episodes.
         agent_edit: Texture, light or other edit of an agent, or of the stop signs; None: none.
+        street_edit: Edit of the street; None: none.
         camera_sensors: Maker of the sensor of a camera, by sensor name; the others are plain cameras.
         changes: Changes of readings, of the ego's own state and of its commands.
         other_images: Images of a camera in other drives, for attacks that are fitted before they are used: from the
@@ -45,6 +47,7 @@ class SensorSuite:
     device: str = "cpu"
     weather: SceneWeather = DAY
     agent_edit: AgentEdit | None = None
+    street_edit: StreetEdit | None = None
     camera_sensors: Mapping[str, CameraSensor] = field(default_factory=dict)
     changes: LoopChanges = field(default_factory=LoopChanges)
     other_images: Callable[[Camera, int], Any] | None = None
@@ -61,9 +64,24 @@ class SensorSuite:
         Raises:
             ConfigError: There is one already.
         """
-        if self.agent_edit is not None:
-            raise ConfigError("an agent or the stop signs are edited already; use one texture or light at a time")
+        self._refuse_second_edit()
         return replace(self, agent_edit=edit)
+
+    def with_street_edit(self, edit: StreetEdit) -> Self:
+        """Return the suite with an edit of the street.
+
+        Raises:
+            ConfigError: There is an edit already.
+        """
+        self._refuse_second_edit()
+        return replace(self, street_edit=edit)
+
+    def _refuse_second_edit(self) -> None:
+        """Raise ConfigError if there is an edit already."""
+        if self.agent_edit is not None or self.street_edit is not None:
+            raise ConfigError(
+                "an agent, the stop signs or the street are edited already; use one texture or light at a time"
+            )
 
     def with_reading_change(self, sensor: str, change: ReadingChange) -> Self:
         """Return the suite with a change of a sensor's readings, after those that it has already."""
@@ -81,7 +99,13 @@ class SensorSuite:
 
     def build(self) -> dict[str, Sensor]:
         """Return the sensors by name, as `ssad.world.rollout.rollout` takes them; images stay on a GPU."""
-        onboard = Onboard(weather=self.weather, device=self.device, resident=True, attack=self.agent_edit)
+        onboard = Onboard(
+            weather=self.weather,
+            device=self.device,
+            resident=True,
+            attack=self.agent_edit,
+            street_edit=self.street_edit,
+        )
         sensors: dict[str, Sensor] = dict(onboard.group_cameras(self.cameras))
         sensors |= {name: make(onboard, self.cameras[name]) for name, make in self.camera_sensors.items()}
         sensors |= {name: onboard.lidar(lidar) for name, lidar in self.lidars.items()}

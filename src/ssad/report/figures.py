@@ -49,11 +49,12 @@ def dot(x: object, y: object, radius: int, colour: str, tip: str = "") -> str:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """A number of a line: its place along the axis, 0 to 1, the number, and its tool tip."""
+    """A number of a line: its place along the axis, 0 to 1, the number, its tool tip, whether it is drawn hollow."""
 
     at: float
     cell: TableCell
     tip: str
+    is_hollow: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,115 @@ def _points(positions: Sequence[tuple[float, float]]) -> str:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """A line with a name.
+
+    Attributes:
+        name: Name in the legend.
+        points: Its points, 0 to 100; those without a number are left out.
+        colour: Colour of the line.
+        dashes: Pattern of its dashes; None: it is solid.
+    """
+
+    name: str
+    points: Sequence[CurvePoint]
+    colour: str
+    dashes: str | None = None
+
+
+@dataclass(frozen=True)
+class CurvePlot:
+    """A plot of lines in percent.
+
+    Attributes:
+        title: Title above it.
+        ticks: Places along the axis, 0 to 1, and their labels.
+        curves: The lines.
+        marks: Places along the axis with a vertical line, and its label.
+    """
+
+    title: str
+    ticks: Sequence[tuple[float, str]]
+    curves: Sequence[Curve]
+    marks: Sequence[tuple[float, str]] = ()
+
+
+CURVE_WIDTH, CURVE_HEIGHT, CURVE_GAP, CURVE_LEFT, CURVE_TOP, LEGEND_COLUMNS = 400, 240, 60, 40, 44, 3
+
+
+def curve_plots(plots: Sequence[CurvePlot], *, label: str, axis: str = "") -> str:
+    """Draw plots side by side, from 0 to 100 %, with intervals as bands, over one legend; as SVG text.
+
+    Args:
+        plots: The plots; all have the same curves.
+        label: Label for screen readers.
+        axis: Title of the horizontal axes.
+    """
+    elements: list[str] = []
+    for number, plot in enumerate(plots):
+        left = CURVE_LEFT + number * (CURVE_WIDTH + CURVE_GAP)
+        elements += _curve_frame(plot, left, axis)
+        for curve in plot.curves:
+            elements += _curve_elements(curve, left)
+    width = CURVE_LEFT + len(plots) * (CURVE_WIDTH + CURVE_GAP) - CURVE_GAP + 10
+    curves = plots[0].curves if plots else ()
+    column_width = (width - CURVE_LEFT) / LEGEND_COLUMNS
+    for number, curve in enumerate(curves):
+        x = CURVE_LEFT + column_width * (number % LEGEND_COLUMNS)
+        y = CURVE_TOP + CURVE_HEIGHT + 58 + 18 * (number // LEGEND_COLUMNS)
+        stroke = {"stroke": curve.colour, "stroke_width": 2, "stroke_dasharray": curve.dashes}
+        elements.append(element("line", x1=x, x2=x + 24, y1=y - 4, y2=y - 4, **stroke))
+        elements.append(label_text(x + 30, y, curve.name))
+    legend_rows = -(-len(curves) // LEGEND_COLUMNS)
+    height = CURVE_TOP + CURVE_HEIGHT + 52 + 18 * legend_rows
+    return figure(elements, label, viewBox=f"0 0 {width} {height}")
+
+
+def _curve_frame(plot: CurvePlot, left: float, axis: str) -> list[str]:
+    """Return title, grid, ticks and marks of a plot."""
+    elements = [label_text(left, 16, plot.title, class_="name")]
+    bottom = CURVE_TOP + CURVE_HEIGHT
+    for percent in (0, 25, 50, 75, 100):
+        y = bottom - CURVE_HEIGHT * percent / 100
+        elements.append(element("line", x1=left, x2=left + CURVE_WIDTH, y1=y, y2=y, class_="grid"))
+        elements.append(label_text(left - 6, y + 4, f"{percent}", anchor="end"))
+    for at, name in plot.ticks:
+        elements.append(label_text(left + CURVE_WIDTH * at, bottom + 16, name, anchor="middle"))
+    elements.append(label_text(left + CURVE_WIDTH / 2, bottom + 34, axis, anchor="middle"))
+    for at, name in plot.marks:
+        x = left + CURVE_WIDTH * at
+        stroke = {"stroke": "var(--soft)", "stroke_dasharray": "2 3"}
+        elements.append(element("line", x1=x, x2=x, y1=CURVE_TOP - 8, y2=bottom, **stroke))
+        elements.append(label_text(x, CURVE_TOP - 12, name, anchor="middle"))
+    return elements
+
+
+def _curve_elements(curve: Curve, left: float) -> list[str]:
+    """Return band, line and points of a curve."""
+
+    def position(at: float, percent: float) -> tuple[float, float]:
+        share = min(max(percent / 100.0, 0.0), 1.0)
+        return left + CURVE_WIDTH * at, CURVE_TOP + CURVE_HEIGHT * (1.0 - share)
+
+    measured = [point for point in curve.points if not math.isnan(point.cell.mean)]
+    with_interval = [point for point in measured if not math.isnan(point.cell.low)]
+    elements = []
+    if with_interval:
+        band = [position(point.at, point.cell.high) for point in with_interval]
+        band += [position(point.at, point.cell.low) for point in reversed(with_interval)]
+        elements.append(element("polygon", points=_points(band), fill=curve.colour, opacity=".13"))
+    path = _points([position(point.at, point.cell.mean) for point in measured])
+    stroke = {"stroke": curve.colour, "stroke_width": 2, "stroke_dasharray": curve.dashes}
+    elements.append(element("polyline", points=path, fill="none", **stroke))
+    for point in measured:
+        x, y = position(point.at, point.cell.mean)
+        tip = element("title", escape(f"{curve.name}, {point.tip}: {point.cell.text} {point.cell.interval}"))
+        fill = "var(--card)" if point.is_hollow else curve.colour
+        elements.append(element("circle", tip, cx=x, cy=y, r=4, fill=fill, stroke=curve.colour, stroke_width=2))
+    return elements
+
+
+@dataclass(frozen=True)
 class HeatMap:
     """One map.
 
@@ -137,6 +247,7 @@ class HeatMap:
         columns: Labels above each column.
         values: By row and column, 0 to 1; absent or None: not measured.
         marked: A cell with a frame.
+        bracketed: Cells whose numbers stand in brackets.
         tips: Tool tips of the cells.
     """
 
@@ -146,6 +257,7 @@ class HeatMap:
     values: Mapping[tuple[str, str], float | None]
     marked: tuple[str, str] | None = None
     tips: Mapping[tuple[str, str], str] | None = None
+    bracketed: frozenset[tuple[str, str]] = frozenset()
 
 
 CELL_WIDTH, CELL_HEIGHT, MAP_LEFT, MAP_TOP, MAP_GAP = 40, 24, 62, 42, 26
@@ -186,6 +298,7 @@ def _map_cell(heat_map: HeatMap, position: tuple[str, str], x: int, y: int) -> s
             f"color-mix(in srgb,var(--crash) {70 * (1 - value):.0f}%,var(--card))",
             f"{100 * value:.0f}",
         )
+    value_text = f"({value_text})" if position in heat_map.bracketed else value_text
     is_marked = position == heat_map.marked
     rectangle = {"x": x + 1, "y": y + 1, "width": CELL_WIDTH - 2, "height": CELL_HEIGHT - 2, "rx": 3}
     frame = {"stroke": "var(--ink)", "stroke_width": 2} if is_marked else {"stroke": "var(--line)"}

@@ -194,6 +194,8 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
 
     def validate(policy: Policy) -> dict[str, float]:
         metrics = measure_adversary(PolicyDriver(policy, name="candidate"), **validation_setup)  # type: ignore[arg-type]
+        if learning.reward == "adversary":  # The paper's reward is for any collision.
+            return metrics | {"score": metrics["CR"]}
         # Proven collisions are few, so the valid ones decide between policies with as many of them.
         return metrics | {"score": metrics["proven"] + 0.1 * metrics["valid"]}
 

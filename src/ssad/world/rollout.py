@@ -411,7 +411,7 @@ def rollout(
     loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation, policies=policies)
     loop.reset()
     # Traces of episodes without drivers of the population are those of earlier versions, to the byte.
-    shows_signals = any(map(_has_drivers, simulator.episodes))
+    shows_signals = any(map(has_drivers, simulator.episodes))
     rows = [_row(simulator.state(), turn_signals=shows_signals)]
     lengths = np.zeros(simulator.batch, np.int64)
     for step in range(1, step_limit(simulator) + 1):
@@ -432,7 +432,7 @@ def route_signals(graph: LaneGraph, route: Route) -> I32:
     return np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
 
 
-def _has_drivers(episode: Episode) -> bool:
+def has_drivers(episode: Episode) -> bool:
     """Return whether an agent of the episode has a driver of the population."""
     return any(agent.driver is not None for agent in episode.agents)
 
@@ -469,7 +469,7 @@ def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: in
     graph = simulator.graphs[episode.town]
     state = simulator.state()
     agent_count = int((state.kind[b] != AgentKind.NONE).sum())
-    agent_names = (*_AGENT, "turn_signal") if _has_drivers(episode) else _AGENT
+    agent_names = (*_AGENT, "turn_signal") if has_drivers(episode) else _AGENT
     agent_fields: dict[str, Any] = {name: rows[name][:steps, b, :agent_count].copy() for name in agent_names}
     ego_names = set(rows) - {*_AGENT, "turn_signal"}
     ego_fields: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name in ego_names}

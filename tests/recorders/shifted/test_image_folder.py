@@ -134,7 +134,7 @@ def test_every_format_is_shifted_and_what_cannot_be_is_named_and_left_out(tmp_pa
     for _ in range(2):
         done = ssad(*words)
         assert done.returncode == 1
-        assert f"{root}: 10 pictures shifted, 1 other files linked unchanged, 100 % of the pictures" in done.stdout
+        assert f"{root}: 10 pictures shifted, 1 other file linked unchanged, 100 % of the pictures" in done.stdout
         for name, reason in {
             "moving.gif": "not a JPEG, PNG, TIFF, BMP, WebP or PNM image",
             "pages.tiff": "it has 2 frames or pages",

@@ -15,9 +15,20 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.lamps import SceneLamp, lamp_strength, lit_circle, nearby_lights, own_lamps
+from ssad.rendering.camera.effects import NO_EFFECTS, select_effects
+from ssad.rendering.camera.lamps import (
+    BRAKE_RATIO,
+    NIGHT_LUX,
+    TO_LUMINANCE,
+    SceneLamp,
+    lamp_strength,
+    lit_circle,
+    low_beam,
+    nearby_lights,
+    own_lamps,
+)
 from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render, scene_light
-from ssad.rendering.camera.scene import RenderScene, SceneObject, collect_objects
+from ssad.rendering.camera.scene import LampSignal, RenderScene, SceneObject, collect_objects
 from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
@@ -42,7 +53,12 @@ def ground() -> Any:
 @pytest.fixture(scope="module")
 def scene() -> RenderScene:
     block = meshes.box((4.0, 2.0, 1.5), material=GREY, centre=(0.0, 0.0, 0.95))  # 0.2 m above the ground
-    return RenderScene(None, [ground(), block, make_body("car", style="suv", generator=generator("lamps"))])
+    wall = build(
+        np.array([[0, -20, -5], [0, 20, -5], [0, 20, 5], [0, -20, 5]], float),
+        np.array([[0, 3, 2], [0, 2, 1]]),
+        materials=(GREY,),
+    )
+    return RenderScene(None, [ground(), block, make_body("car", style="suv", generator=generator("lamps")), wall])
 
 
 def above(height: float, *things: SceneObject, **other: Any) -> View:
@@ -245,3 +261,101 @@ def test_fine_shadows_are_finer(scene: RenderScene) -> None:
         errors.append(abs(float(where[np.flatnonzero(row < half)[0]]) - edge))
     assert errors[0] < 0.06
     assert errors[0] < errors[1] + 0.02
+
+
+# UN Regulation No. 112, class B, right-hand traffic: degrees to the right and up, least and largest intensity, cd
+BEAM_LIMITS = {
+    "B50L": (-3.43, 0.57, 0.0, 350.0),
+    "HV": (0.0, 0.0, 0.0, 625.0),
+    "75R": (1.15, -0.57, 10100.0, 1e9),
+    "75L": (-3.43, -0.57, 0.0, 10600.0),
+    "50L": (-3.43, -0.86, 0.0, 13200.0),
+    "50V": (0.0, -0.86, 5100.0, 1e9),
+    "50R": (1.72, -0.86, 10100.0, 1e9),
+    "25L": (-9.0, -1.72, 1700.0, 1e9),
+    "25R": (9.0, -1.72, 1700.0, 1e9),
+    "zone IV left": (-5.15, -1.72, 2500.0, 1e9),
+    "zone I": (0.0, -4.0, 0.0, 17600.0),
+}
+
+
+def test_a_low_beam_meets_the_limits_of_its_regulation(scene: RenderScene) -> None:
+    """Illuminance of a wall 25 m ahead of a vehicle, as the regulation measures it; both lamps give twice a lamp's."""
+    lamp = low_beam(at(0.0, 0.0, 0.0), 1.0, 1e6)
+    camera = Camera(256, 128, np.array([[384.0, 0, 128.0], [0, 384.0, 64.0], [0, 0, 1]]))
+    view = View(camera, at(0.0, 0.0, 0.0, FORWARD), (SceneObject(3, at(25.0, 0.0, 0.0)),), NIGHT, lamps=(lamp,))
+    lit, dark = (render(scene, [v], surface=True).surface for v in (view, replace(view, lamps=())))
+    assert lit is not None
+    assert dark is not None
+    lux = (lit.irradiance[0].astype(float) - dark.irradiance[0]) @ TO_LUMINANCE / NIGHT_LUX
+    distance = np.linalg.norm(lit.position[0], axis=-1)
+    candela = 0.5 * lux * distance**3 / 25.0
+    for name, (right, up, least, most) in BEAM_LIMITS.items():
+        column = 128.0 + 384.0 * np.tan(np.radians(right))
+        row = 64.0 - 384.0 * np.tan(np.radians(up))
+        found = candela[int(row), int(column)]
+        assert least <= found <= most, f"{name}: {found:.0f} cd"
+    above, below = candela[:60, 100:128].mean(), candela[70:76, 100:128].mean()
+    assert below > 20.0 * above, "a cut-off"
+    assert candela.max() == pytest.approx(12000.0, rel=0.1)
+
+
+def test_the_effect_gives_head_lamps_their_pattern(scene: RenderScene) -> None:
+    """Of the vehicle that carries the camera, and of others; without it both light as before."""
+    car = SceneObject(2, at(20.0, 0.0, 0.0, np.diag([-1.0, -1, 1, 1])), tag=1)
+    own = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)),), NIGHT)
+    views = [
+        *(replace(own, lamps=lamps) for lamps in (own_lamps(np.eye(4), NIGHT), ())),
+        *(replace(own, objects=(*own.objects, replace(car, is_lit=is_lit))) for is_lit in (True, False)),
+    ]
+    even, pattern = (
+        render(scene, views, quality=RenderQuality(effects=effects)).radiance.astype(float).sum(-1)
+        for effects in (NO_EFFECTS, select_effects("low-beams"))
+    )
+    assert np.array_equal(even[1], pattern[1])
+    assert np.array_equal(even[3], pattern[3])
+    # The road from 50 m on, and that between the car and the camera.
+    (own_even, own_pattern), (even_gain, pattern_gain) = (
+        [(rendered[lit] - rendered[lit + 1])[rows].sum() for rendered in (even, pattern)]
+        for lit, rows in ((0, slice(49, 51)), (2, slice(58, 96)))
+    )
+    assert own_pattern > 2.0 * own_even
+    assert pattern_gain > 1.2 * even_gain
+    with pytest.raises(ConfigError, match="pattern"):
+        SceneLamp(np.eye(4), 1.0, pattern="high")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="low beam"):
+        SceneLamp(np.eye(4), 1.0, pattern="low_beam")
+
+
+@pytest.mark.parametrize("weather", [SceneWeather(), NIGHT], ids=["day", "night"])
+def test_stop_lamps_and_indicators_shine(scene: RenderScene, weather: SceneWeather) -> None:
+    """Seen from behind, with the effect alone: red for the brake, amber on the side of the turn."""
+    camera = Camera(128, 64, np.array([[192.0, 0, 64.0], [0, 192.0, 32.0], [0, 0, 1]]))
+    view = View(camera, at(0.0, 0.0, 1.0, FORWARD), (SceneObject(0, np.eye(4)),), weather)
+    quality = RenderQuality(effects=select_effects("vehicle-signals"))
+
+    def gained(signals: int, quality: RenderQuality = quality) -> Any:
+        cars = [SceneObject(2, at(9.0, 0.0, 0.0), tag=1, signals=bits) for bits in (signals, 0)]
+        views = [replace(view, objects=(*view.objects, car)) for car in cars]
+        lit, dark = render(scene, views, quality=quality).radiance.astype(float)
+        return np.where(np.abs(lit - dark) > 0.5, lit - dark, 0.0)
+
+    brake = gained(LampSignal.BRAKE)
+    assert (brake[..., 0] > 1.0).sum() > 20
+    assert brake[..., 0].sum() > 10.0 * brake[..., 1].sum()
+    assert brake[:, :64].sum() == pytest.approx(brake[:, 64:].sum(), rel=0.2)
+    left, right = gained(LampSignal.LEFT), gained(LampSignal.RIGHT)
+    assert left[:, :64].sum() > 5.0
+    assert not left[:, 64:].any()
+    assert right[:, 64:].sum() == pytest.approx(left[:, :64].sum(), rel=0.2)
+    assert not right[:, :64].any()
+    assert 0.15 < left[..., 1].sum() / left[..., 0].sum() < 0.5, "amber"
+    assert not gained(LampSignal.BRAKE, RenderQuality()).any(), "the effect is off"
+
+
+def test_stop_lamps_light_the_road_behind(scene: RenderScene) -> None:
+    cars = [SceneObject(2, at(10.0, 0.0, 0.0), tag=1, signals=signals) for signals in (LampSignal.BRAKE, 0)]
+    stop, tail = (
+        lit_lamps(scene, View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)), car), NIGHT))[1]["light"] for car in cars
+    )
+    assert stop == pytest.approx(BRAKE_RATIO * tail)

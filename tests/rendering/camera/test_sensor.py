@@ -45,6 +45,9 @@ SENSORS = {
     "lens alone": SensorModel(mosaic=False),
     "soon full": SensorModel(blur=0.7, full=0.4),
     "three colours, soon full": SensorModel(blur=0.3, mosaic=False, full=0.4),
+    "warm and pale": SensorModel(balance=(1.2, 1.0, 0.8), saturation=0.6),
+    "hazy and hard": SensorModel(glare=0.6, flare=30.0, gamma=0.8, contrast=0.5),
+    "three colours, vivid and soft": SensorModel(mosaic=False, saturation=1.3, gamma=1.2, contrast=-0.3),
 }
 
 
@@ -112,6 +115,19 @@ def test_a_pinhole_is_the_curve_of_the_light() -> None:
     light = np.clip(radiance * np.float32(DAY_EXPOSURE), 0, np.float32(3.999))
     place = (np.sqrt(light) * np.float32(0.5) * 4096).astype(int)
     assert (developed(radiance, [PINHOLE]) == response()[place]).all()
+
+
+def test_colours_and_tones_are_the_stated_ones() -> None:
+    grey = np.full((1, 8, 8, 3), 0.2, np.float32) * np.float32([1.0, 0.5, 2.0])
+    balanced = replace(PINHOLE, balance=(1.0, 2.0, 0.5))
+    assert (developed(grey, [balanced], 1.0) == round(255 * float(curve(torch.tensor(0.2))))).all()
+    pale = developed(grey, [replace(PINHOLE, saturation=0.0)], 1.0)[0, 0, 0]
+    assert len(set(pale.tolist())) == 1
+    for gamma, contrast in ((0.7, 0.0), (1.0, 0.6), (1.4, -0.4)):
+        table = response(gamma, contrast) / 255
+        code = np.clip(response() / 255, 0, 1) ** gamma
+        assert table == pytest.approx(code + contrast * code * (1 - code) * (2 * code - 1), abs=0.02)
+        assert (np.diff(table) >= 0).all()
 
 
 @pytest.mark.parametrize("sensor", [SensorModel(), SensorModel(mosaic=False, blur=0.7)])
@@ -283,6 +299,8 @@ def test_every_part_has_the_gradient_of_finite_differences() -> None:
     check(lambda v: curve(v * 0.002), raw)
     check(lambda v: develop(v, exposure, sensor, sample), light)
     check(lambda v: develop(v, exposure, SensorModel(mosaic=False)), light)
+    toned = SensorModel(balance=(1.2, 1.0, 0.7), saturation=0.6, gamma=0.8, contrast=0.5)
+    check(lambda v: develop(v, exposure, toned), light)
 
 
 @pytest.mark.parametrize("subsampling", ["420", "444"])

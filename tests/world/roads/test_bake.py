@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -169,6 +170,40 @@ def test_signs_of_a_map_are_known_by_what_they_name(tmp_path: Path) -> None:
     assert where[3] in ruled, "the lane before the one that refers to it"
     for name in ("stop_lane", "stop_s", "signal_xy", "signal_virtual", "xy", "succ"):
         assert np.array_equal(getattr(changed, name), getattr(plain, name)), "signs change nothing that is driven by"
+
+
+def test_junctions_without_lights_and_signs_are_controlled_where_it_is_asked_for(
+    tmp_path: Path, ssad_home: Path
+) -> None:
+    """Junctions with lights, those with a sign, and the roads between them stay as the map has them."""
+    root = ElementTree.fromstring(SMALL)
+    for speed in root.iter("speed"):
+        speed.set("max", "100")
+        speed.set("unit", "km/h")
+    posts = [(road, post) for road in root.findall("road") for post in road.findall("signals/signal[@dynamic='no']")]
+    sign = min(post.get("id", "") for _, post in posts)
+    for road, post in posts:
+        if post.get("id") != sign:
+            road.find("signals").remove(post)
+    path = _map(tmp_path, ElementTree.tostring(root, encoding="unicode"))
+    report = ImportReport("small")
+    plain = load_graph(import_map(path, "small", ssad_home))
+    slow = load_graph(import_map(path, "small", ssad_home, uncontrolled="slow", report=report))
+    lit = load_graph(import_map(path, "small", ssad_home, uncontrolled="signals"))
+    assert np.unique(plain.speed_limit) == pytest.approx([100.0 / 3.6])
+    signed = {int(plain.junction[after]) for lane in plain.rule_lane for after in plain.successors(int(lane))} - {-1}
+    uncontrolled = set(plain.signal_junction[plain.signal_virtual].tolist()) - signed
+    assert len(signed) == 1
+    assert len(uncontrolled) == 3
+    across = np.isin(plain.junction, list(uncontrolled)) & (plain.kind == LaneType.DRIVING)
+    assert slow.speed_limit[across] == pytest.approx(50.0 / 3.6)
+    assert slow.speed_limit[~across] == pytest.approx(100.0 / 3.6)
+    assert are_equal(replace(slow, speed_limit=plain.speed_limit), plain)
+    assert report.notes["the speed limit across junctions without lights and signs is 50 km/h"] == [
+        f"junction {junction}" for junction in sorted(uncontrolled)
+    ]
+    assert set(lit.signal_junction[lit.signal_virtual].tolist()) == signed
+    assert are_equal(replace(lit, signal_virtual=plain.signal_virtual), slow)
 
 
 def _map(folder: Path, text: str) -> Path:

@@ -20,7 +20,7 @@ from ssad.core.detections import Detections
 from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.perception import I64, Objects, Tracks, no_objects
+from ssad.core.perception import I64, Objects, PerceivedLane, Tracks, no_objects
 from ssad.core.rotations import upright_poses
 from ssad.core.types import F32, F64, I32, U8, Bool, Controller, Episode
 from ssad.drivers.perceiving.ego_boxes import EgoBoxes, boxes_in_world, check_boxes, stop_sign_positions
@@ -83,6 +83,23 @@ class TrackingEvent:
     tracks: Tracks
 
 
+@dataclass(frozen=True, eq=False)
+class LaneEvent:
+    """Lane that a lane keeper believes in at a step, for observers.
+
+    Attributes:
+        scene: Index of the scene.
+        time: s.
+        lane: The lane; None: none was found yet.
+        image: Image that it was detected in, uint8 [3, H, W].
+    """
+
+    scene: int
+    time: float
+    lane: PerceivedLane | None
+    image: U8
+
+
 class PerceivingDriver:
     """Driver that perceives: by default the Autopilot on the belief of a perceiver.
 
@@ -119,7 +136,7 @@ class PerceivingDriver:
         tracking: TrackerSettings | None = None,
         rate: float = 5.0,
         latency: float = 0.1,
-        watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
+        watch: Callable[[PerceptionEvent | TrackingEvent | LaneEvent], None] | None = None,
         repair: RepairedAgents | None = None,
         signs: SignReading | None = None,
     ) -> None:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.perception import DrivePerception
+from ssad.core.perception import DrivePerception, PerceivedLane
 from ssad.core.types import F64, U8
-from ssad.drivers.perceiving.driver import PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.driver import LaneEvent, PerceptionEvent, TrackingEvent
 
 
 class PerceptionRecorder:
@@ -28,14 +28,21 @@ class PerceptionRecorder:
         self.known: list[list[Any]] = [[] for _ in range(scenes)]
         self._shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
         self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
+        self.lanes: list[list[tuple[float, PerceivedLane | None]]] = [[] for _ in range(scenes)]
 
-    def __call__(self, event: PerceptionEvent | TrackingEvent) -> None:
+    def __call__(self, event: PerceptionEvent | TrackingEvent | LaneEvent) -> None:
         """See `PerceivingDriver`."""
+        if isinstance(event, LaneEvent):
+            self.lanes[event.scene].append((event.time, event.lane))
+            if self.every is not None:
+                self._store_image(self._shots[event.scene], event.time, event.image, self.every)
+            return
         if isinstance(event, PerceptionEvent):
             self.looks[event.scene].append((event.time, event.objects))
             if event.signs is not None:
                 self.signs[event.scene].append((event.time, event.signs))
-            if self.every is not None:
+            # The images of a lane keeper come with its lanes, more often.
+            if self.every is not None and not self.lanes[event.scene]:
                 for image in list(event.images.values())[:1]:
                     self._store_image(self._shots[event.scene], event.time, image, self.every)
             return
@@ -63,7 +70,7 @@ class PerceptionRecorder:
 
     def perception(self, scene: int) -> DrivePerception:
         """Return the perception in a scene."""
-        return DrivePerception(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
+        return DrivePerception(self.looks[scene], self.known[scene], self.cameras, self.signs[scene], self.lanes[scene])
 
 
 def _channels_last(picture: Any) -> U8:

@@ -16,7 +16,8 @@ from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
 from ssad.core.source import plugin_version
 from ssad.detectors import DETECTORS
-from ssad.drivers.perceiving.driver import PerceivingDriver, PerceptionEvent, TrackingEvent
+from ssad.drivers.lane_keeping.driver import CHANNEL, LaneKeeper
+from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver, PerceptionEvent, TrackingEvent
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     cameras_of,
@@ -44,6 +45,7 @@ KEYS_OF_PERCEIVER: Final = (
 )
 KEYS_OF_TRACKER: Final = ("confirm", "reserve")
 NAMED: Final = ("perceiver", "tracker", "planner")
+ROUTE: Final = "route"
 
 
 def _single_name(part: str | dict[str, Any]) -> str | dict[str, Any]:
@@ -78,6 +80,8 @@ class PerceivingSystem(Schema):
             input_width, missed, burst, noise and phantoms describe (`ssad list perceivers`).
         tracker: tracker in place of the one that confirm, reserve, high and low describe (`ssad list trackers`).
         planner: planner in place of the Autopilot's (`ssad list planners`).
+        steers_by: route: it follows its route, which is given; markings: a lane keeper, which steers by the lane
+            markings that it detects in its front camera (`ssad.drivers.lane_keeping`), and stops where it loses them.
     """
 
     name: str = Field(min_length=1)
@@ -101,17 +105,19 @@ class PerceivingSystem(Schema):
     perceiver: Part | None = None
     tracker: Part | None = None
     planner: Part | None = None
+    steers_by: Literal["route", "markings"] = ROUTE
 
     @model_serializer(mode="wrap")
     def _without_unnamed_parts(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave parts out that are not named: the dump enters the keys of cells, which must not change by them."""
         values: dict[str, Any] = dump(self)
-        return {key: value for key, value in values.items() if key not in NAMED or value is not None}
+        values = {key: value for key, value in values.items() if key not in NAMED or value is not None}
+        return {key: value for key, value in values.items() if (key, value) != ("steers_by", ROUTE)}
 
     @property
     def version(self) -> str:
         """Hashes of the weights and source of its detector, and versions of the parts that are named; "" without."""
-        built_in_detector = self.perceiver is None and not self.is_perfect
+        built_in_detector = self.perceiver is None and not self._has_perfect_perceiver
         versions = []
         if built_in_detector:
             versions.append(state_hash(self._make_perceiver().detector))
@@ -126,6 +132,18 @@ class PerceivingSystem(Schema):
     @property
     def is_perfect(self) -> bool:
         """True if no perturbation of images reaches it: it is given the truth, or reads no camera."""
+        if self.keeps_lane:
+            return False
+        return self._has_perfect_perceiver
+
+    @property
+    def keeps_lane(self) -> bool:
+        """True for a lane keeper."""
+        return self.steers_by != ROUTE
+
+    @property
+    def _has_perfect_perceiver(self) -> bool:
+        """True if no perturbation of images reaches its perceiver."""
         if self.perceiver is None:
             return self.detector == "truth"
         perceiver = self._make_perceiver()
@@ -159,6 +177,8 @@ class PerceivingSystem(Schema):
         """
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
+        if self.keeps_lane and self.planner is not None:
+            raise ConfigError(f"system {self.name}: with steers_by: markings the lane keeper plans; remove planner")
         if self.sign_memory is not None and not self.reads_signs:
             raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
         for kind, keys in (("perceiver", KEYS_OF_PERCEIVER), ("tracker", KEYS_OF_TRACKER)):
@@ -186,7 +206,7 @@ class PerceivingSystem(Schema):
 
     def make(
         self,
-        watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
+        watch: Callable[[PerceptionEvent | TrackingEvent | LaneEvent], None] | None = None,
         *,
         repair: RepairedAgents | None = None,
         device: str = "cpu",
@@ -208,10 +228,14 @@ class PerceivingSystem(Schema):
             SignReading(confirm=self.confirm, memory=memory_seconds, score=tracking.high) if self.reads_signs else None
         )
         built_in = tracker_name in ("", "kalman")
-        driver = PerceivingDriver(
+        make_driver: Callable[..., PerceivingDriver] = PerceivingDriver
+        planner: dict[str, Any] = {"planner": None if self.planner is None else self._make_part("planner")}
+        if self.keeps_lane:
+            make_driver, planner = LaneKeeper, {"camera": nuscenes_cameras(self.width)[CHANNEL]}
+        driver = make_driver(
             self._make_perceiver(device),
             tracker=None if built_in else self._make_part("tracker"),
-            planner=None if self.planner is None else self._make_part("planner"),
+            **planner,
             rate=self.rate,
             latency=self.latency,
             tracking=tracking if built_in else None,
@@ -245,7 +269,7 @@ class PerceivingSystem(Schema):
                 options = {"threshold": tracking.low} | options
             return _perceiver(name, dump_json(options), device)
         cameras = nuscenes_cameras(self.width, self.cameras)
-        if self.is_perfect:
+        if self._has_perfect_perceiver:
             return PerfectPerceiver(
                 cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
             )

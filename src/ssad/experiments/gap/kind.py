@@ -19,11 +19,12 @@ from ssad.core.images import save_picture
 from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.core.traces import first_difference, load_trace
+from ssad.drivers.lane_keeping.markings import TopView
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
 from ssad.experiments.gap import page
 from ssad.experiments.gap.drive_sheet import RecordedDrive, drive_film, drive_sheet
-from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
+from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired, perturbation_of
 from ssad.experiments.gap.verdict import verdict
 from ssad.experiments.scenario_kind import (
     DescribedScenario,
@@ -33,6 +34,7 @@ from ssad.experiments.scenario_kind import (
     drive_record,
 )
 from ssad.metrics.driving import LIMITS
+from ssad.metrics.lane_keeping import lane_course, lane_metrics
 from ssad.metrics.perception_in_drive import (
     BANDS,
     SIGN_BANDS,
@@ -50,6 +52,7 @@ from ssad.scenarios.static.perturbation import EGO, Perturbation
 from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
 from ssad.simulators.closed_loop import build_requested_episode, cached_town, system_version
 
+VIEW_AHEAD = TopView().far  # m: range of the lane keeper
 FRAME_INTERVAL = 0.2  # s from one frame of a film to the next
 
 
@@ -118,6 +121,16 @@ class Gap(ScenarioKind):
         Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher", limits=NOT_NEGATIVE),
         Column("hard_braking", "times of braking above 4 m/s^2", "", "lower", limits=NOT_NEGATIVE),
         Column("phantom_stop_s", "time stood before a phantom", "s", "lower", limits=NOT_NEGATIVE),
+        Column("off_road", "OR", "m", "lower", limits=NOT_NEGATIVE),
+        Column("distance_to_route", "DR", "m", "lower", limits=NOT_NEGATIVE),
+        Column("lane_deviation", "distance to the middle of the lane", "m", "lower", limits=NOT_NEGATIVE),
+        Column("lane_deviation_max", "greatest distance to it", "m", "lower", limits=NOT_NEGATIVE),
+        Column("lane_departure", "share of the drives that leave the lane", "", "lower", limits=SHARE),
+        Column("departure_time", "time to the departure from the lane", "s", "higher", limits=NOT_NEGATIVE),
+        Column(
+            "lane_error", "error of the middle of the lane that the camera found", "m", "lower", limits=NOT_NEGATIVE
+        ),
+        Column("lane_seen", "share of the steps in which the lane was found", "", "higher", limits=SHARE),
     )
     factors = ("system", "perturbation", "severity")
     metric_limits = LIMITS
@@ -222,6 +235,11 @@ class Gap(ScenarioKind):
                 metrics |= component_metrics(trace, perceived, phantom_score=system.tracking.high)
                 metrics |= sign_metrics(trace, perceived, signs_of_route(cached_town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
+                if system.keeps_lane:
+                    place = getattr(perturbation_of(cell.spec), "place_distance", None)
+                    graph = cached_town(trace.town)
+                    metrics |= lane_metrics(trace, graph, perceived.lanes, place=place, view=VIEW_AHEAD)
+                    record_fields["lane"] = lane_course(trace, graph)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
                 if job.settings["sheets"] and (sheet_images := perception.images(index)):
                     result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"

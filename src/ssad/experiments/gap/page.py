@@ -17,6 +17,7 @@ from ssad.core.folders import path_inside
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.rank import family_correlation
+from ssad.experiments.gap.lane_figure import course_plot
 from ssad.report.figures import MetricChange, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
@@ -51,9 +52,22 @@ SIGNS = {
     "sign_read_at": "first read at, m",
     "stop_signs": "signs run",
 }
+LANES = {
+    "collision": "CR",
+    "off_road": "OR, m",
+    "distance_to_route": "DR, m",
+    "route_completion": "RC",
+    "lane_departure": "leaves the lane",
+    "departure_time": "after, s",
+    "lane_deviation": "from the middle, m",
+    "lane_deviation_max": "at most, m",
+    "lane_error": "error of the camera, m",
+    "lane_seen": "lane found",
+}
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
 BOUNDED = ("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
+BOUNDED += ("lane_departure", "lane_seen")
 CONDITION = {
     "System": field("system"),
     "Perturbation": field("perturbation"),
@@ -86,7 +100,8 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
     """Return the page and its tables."""
     main, drop, rank, cause = (build_table(run) for build_table in (main_table, drop_table, rank_table, cause_table))
     ceilings, errors, signs = (build_table(run) for build_table in (ceiling_table, error_table, sign_table))
-    tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs) if table.rows)]
+    lanes = lane_table(run)
+    tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs, lanes) if table.rows)]
     failures = [
         ([line["system"], line["perturbation"], str(line["severity"]), scenario_of(line)], line["reason"])
         for line in run.failures
@@ -102,6 +117,8 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
         rank=rank,
         cause=cause,
         signs=signs,
+        lanes=lanes,
+        courses=lane_courses(run),
         plot=scatter(run),
         failures=failures,
         sheets=sheets(run),
@@ -276,6 +293,36 @@ def sign_table(run: Run) -> Table:
         note="Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at "
         "5 to 20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation.",
     )
+
+
+def lane_table(run: Run) -> Table:
+    """Return how lane keepers kept their lane, a row a condition."""
+    return Table.pivot(
+        "lanes",
+        "Lane keeping",
+        run.lines,
+        rows=CONDITION,
+        columns=LANES,
+        metric=_cell,
+        condition=lambda lines: any(
+            metric_of(line, "lane_deviation") == metric_of(line, "lane_deviation") for line in lines
+        ),
+        note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, route completed. "
+        "A drive leaves the lane where the body crosses a line; after: from the moment when the cause comes into view, "
+        "or from the start where there is none, of the drives that do. From the middle: mean distance to it. Error of "
+        "the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
+    )
+
+
+def lane_courses(run: Run) -> str:
+    """Draw the deviation along each scenario, a panel a scenario and a line a condition; "" without lane keepers."""
+    courses: dict[str, dict[str, Mapping[str, Sequence[float]]]] = {}
+    for line in run.lines:
+        if line.get("lane") and not line["spec"].get("repetition", 0):
+            severity = f" {line['severity']}" if int(line["severity"]) > 1 else ""
+            label = "clean" if not int(line["severity"]) else f"{line['perturbation']}{severity}"
+            courses.setdefault(f"{line['system']}, {scenario_of(line)}", {})[label] = line["lane"]
+    return course_plot(courses, label="Deviation from the middle of the lane along the route") if courses else ""
 
 
 def family_of_line(line: Line) -> str:

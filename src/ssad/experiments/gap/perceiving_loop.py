@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,8 @@ def drive_perceiving(
         device=device,
         other_images=lambda camera, count: images_of_other_drives(camera, count, device),
     )
+    # A lane keeper has a camera besides those of its perceiver.
+    suite = replace(suite, cameras={**suite.cameras, **driver.cameras})
     if perturbation is not None:
         suite = perturbation.in_loop(suite, target=spec["target"], victim=driver.detector, seed=seed)
     drive_results = drive(

@@ -95,11 +95,13 @@ class TargetCondition:
         images: The images.
         perturbation: The perturbation; None: the images are clean.
         name: The target in words.
+        floor: AP50 of the clean images below which a perturbation has no score; None: that of the suite.
     """
 
     images: RelightableTargetImages
     perturbation: Perturbation | None
     name: str
+    floor: float | None = None
 
 
 Sightings = Sequence[TargetSighting]
@@ -291,14 +293,15 @@ class OpenLoopKind(Kind):
             clean = tuple(sightings(detector, perturbation.clean_target(images)))
         if perturbation is None:
             return target_scores(clean, **bootstrap) | self.target_columns(cell, job, condition, clean, None)
-        clean_precision, floor = round(precision(clean) or 0.0, 6), settings["floor"]
+        clean_precision = round(precision(clean) or 0.0, 6)
+        floor = settings["floor"] if condition.floor is None else condition.floor
         if clean_precision < floor:  # what is not found anyway cannot be hidden
             raise CellError(
                 f"{cell.system} finds the clean {condition.name} with AP50 {clean_precision:.3f}, which is less than "
                 f"the floor of {floor:g}"
             )
         attacked = tuple(sightings(detector, perturbation.on_target(images)))
-        scores = target_scores(attacked, clean, floor=floor, **bootstrap) | {"clean_AP50": clean_precision}
+        scores = target_scores(attacked, clean, floor=settings["floor"], **bootstrap) | {"clean_AP50": clean_precision}
         return scores | self.target_columns(cell, job, condition, clean, attacked)
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ssad.rendering.bodies.cabin import Driver, cabin
+from ssad.rendering.bodies.car_details import front_details, plain_side, rear_details
 from ssad.rendering.bodies.parts import (
     CHROME,
     DARK,
+    GLASS,
     HEAD,
-    PLATE,
     RIM,
     STEEL,
     TAIL,
@@ -20,7 +22,7 @@ from ssad.rendering.bodies.parts import (
     finish,
     wheels,
 )
-from ssad.rendering.bodies.shell import B3, S3, S4, S5, U0, U2, Shell, axle_x, charts, end_x, sections, shell_mesh
+from ssad.rendering.bodies.shell import B3, S3, S4, S5, U0, U2, Shell, axle_x, charts, sections, shell_mesh
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, box, build, sphere
 
 _PLAN = ((0.0, 0.83), (0.02, 0.90), (0.06, 0.955), (0.18, 1.0), (0.80, 1.0), (0.94, 0.955), (0.98, 0.91), (1.0, 0.86))
@@ -195,6 +197,11 @@ PICKUP = replace(
     wheel_width=0.26,
 )
 
+# A car of foam under printed covers: the shape of a small hatchback, without mirrors that stand out.
+GLOBAL_VEHICLE_TARGET = replace(HATCHBACK, body=0.985, wheel_width=0.16, sill=0.10)
+COVER = Material("cover", (0.70, 0.70, 0.69), specular=0.03, gloss=0.15)
+PRINT_GLOSS = 0.15  # of everything that is printed on its covers
+
 STYLES: dict[str, Shell] = {
     "sedan": SEDAN,
     "hatchback": HATCHBACK,
@@ -202,15 +209,22 @@ STYLES: dict[str, Shell] = {
     "suv": SUV,
     "van": VAN,
     "pickup": PICKUP,
+    "global_vehicle_target": GLOBAL_VEHICLE_TARGET,
 }
 
 
-def car(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """Return a car of a style that fills its size (length, width with mirrors, height), m."""
-    style_shell = STYLES[style]
+def car(style: str, size: Point, *, generator: np.random.Generator, detail: int, has_driver: bool = True) -> Mesh:
+    """Return a car of a style that fills its size (length, width with mirrors, height), m.
+
+    Its interior shows behind the panes; with `has_driver`, the driver does, too. The global vehicle target is a car
+    of foam: nobody drives it, its covers keep their colour, and nothing on them shines.
+    """
+    style_shell, is_target = STYLES[style], style == "global_vehicle_target"
     variation = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
-    chrome, roof_rails = generator.random(2)
+    chrome, roof_rails = (float(share) for share in generator.random(2))
     spokes = int(generator.integers(5, 8))
+    if is_target:  # one of them is like the other
+        variation, chrome, roof_rails, spokes = np.zeros(4), 0.5, 0.0, 5
     shell = replace(
         style_shell,
         radius=style_shell.radius * (1.0 + 0.02 * variation[0]),
@@ -218,7 +232,8 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int)
         tumble=style_shell.tumble * (1.0 + 0.06 * variation[2]),
         lamp_from=float(np.clip(style_shell.lamp_from + 0.05 * variation[3], 0.45, 0.75)),
     )
-    parts = [shell_mesh(shell, size, detail=detail)]
+    body = shell_mesh(shell, size, detail=detail)
+    parts = [body]
     radius = shell.radius * size[2]
     wheel_y = 0.5 * size[1] * shell.body - 0.012
     places = [(axle_x(shell, size, axle_share), wheel_y) for axle_share in shell.axles]
@@ -227,12 +242,28 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int)
     wheel_options: dict[str, object] = {"rim": rim_share, "spokes": spokes, "steel": rim_material, "top": False}
     parts.append(wheels(places, radius, shell.wheel_width, detail=detail, **wheel_options))
     has_rails = roof_rails > 0.4 and style in ("suv", "estate")
-    parts += fittings(shell, size, detail=detail, chrome=chrome > 0.6, rails=has_rails)
-    return finish(parts, charts(shell, size), size)
+    parts += fittings(shell, size, body, detail=detail, chrome=chrome > 0.6, rails=has_rails)
+    if detail > 0:
+        parts += rear_details(shell, size, body, detail=detail, chrome=chrome)
+        parts += front_details(shell, size, body, detail=detail)
+        # The share of the roof rails also picks the driver: a car takes the same number of draws with and without.
+        driver = Driver.drawn(roof_rails) if has_driver and not is_target else None
+        parts += cabin(shell, size, body, detail=detail, driver=driver)
+    mesh = finish(parts, charts(shell, size), size)
+    return _printed(mesh) if is_target else mesh
 
 
-def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: bool) -> list[Mesh]:
-    """Return mirrors, plates, handles, roof rails and exhaust; at detail 0 mirrors and lamps only."""
+def _printed(mesh: Mesh) -> Mesh:
+    """Return the mesh of a car as printed covers over foam."""
+    materials = tuple(
+        COVER if material.paint else replace(material, gloss=min(material.gloss, PRINT_GLOSS), emission=0.0)
+        for material in mesh.materials
+    )
+    return replace(mesh, materials=materials)
+
+
+def fittings(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: bool, rails: bool) -> list[Mesh]:
+    """Return mirrors, handles, roof rails and exhaust; at detail 0 mirrors and lamps only."""
     _, width, height = size
     positions = np.array([shell.windows[0][0] + 0.012, 0.0, 1.0, shell.doors[0][2] - 0.02, shell.doors[-1][2] - 0.02])
     half_sections = sections(shell, size, positions, detail=2)
@@ -241,7 +272,7 @@ def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: boo
     bright_material: Material = CHROME if chrome else TRIM
     mirror_centre = (window_base[0], 0.5 * width - 0.5 * mirror_reach, window_base[2] + 0.075)
     if detail == 2:
-        mirror = sphere((0.075, 0.5 * mirror_reach, 0.085), material=TRIM, centre=mirror_centre, segments=10)
+        mirror = sphere((0.075, 0.5 * mirror_reach, 0.085), material=TRIM, centre=mirror_centre, segments=8)
     elif detail == 1:
         mirror = box((0.12, mirror_reach, 0.15), material=TRIM, centre=mirror_centre)
     else:
@@ -260,36 +291,19 @@ def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: boo
                 both_sides(_plate_x(centre, ((1.0 - lamp_start) * lower[1], upper[2] - lower[2]), material, direction))
             )
         return parts
-    plate_z = (
-        half_sections[1, S3][2] - 0.10,
-        half_sections[2, S4][2] - 0.02 if shell.deck < 0.97 else half_sections[2, S3][2] + 0.04,
-    )
-    for front, z in zip((True, False), plate_z, strict=True):
-        x = end_x(shell, size, float(z), front=front)
-        parts.append(box((0.03, 0.50, 0.115), material=PLATE, centre=(x, 0.0, float(z))))
-    if detail == 2:
-        for section in half_sections[3:]:
-            handle = as_point(section[S5] - [0.0, 0.0, 0.03])
-            parts.append(both_sides(box((0.17, 0.03, 0.028), material=bright_material, centre=handle)))
-        outlet = (float(half_sections[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
-        parts.append(box((0.09, 0.10, 0.07), material=DARK, centre=outlet))
-        if chrome:
-            lower, upper = half_sections[1, shell.grille[0]], half_sections[1, shell.grille[1]]
-            z = float(0.5 * (lower[2] + upper[2]))
-            centre = (end_x(shell, size, z, front=True), 0.0, z)
-            parts.append(box((0.02, 0.78 * lower[1], 0.025), material=CHROME, centre=centre))
-        if rails:
-            rail_ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
-            mirror_centre = tuple(0.5 * (rail_ends[0] + rail_ends[1]) + [0.0, -0.05, 0.05])
-            parts.append(
-                both_sides(
-                    box(
-                        (float(rail_ends[0, 0] - rail_ends[1, 0]), 0.035, 0.04),
-                        material=bright_material,
-                        centre=mirror_centre,
-                    )
-                )
-            )
+    mirror_glass = (mirror_centre[0] - 0.077, mirror_centre[1], mirror_centre[2])
+    parts.append(both_sides(_plate_x(mirror_glass, (0.84 * mirror_reach, 0.115), GLASS, -1.0)))
+    handles = half_sections[3:][:, S5] - [0.0, 0.0, 0.03]
+    if detail == 1:
+        return parts + plain_side(shell, size, body, handles[:, [0, 2]], bright_material)
+    parts += [both_sides(box((0.17, 0.03, 0.028), material=bright_material, centre=as_point(h))) for h in handles]
+    outlet = (float(half_sections[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
+    parts.append(box((0.09, 0.10, 0.07), material=DARK, centre=outlet))
+    if rails:
+        rail_ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
+        mirror_centre = tuple(0.5 * (rail_ends[0] + rail_ends[1]) + [0.0, -0.05, 0.05])
+        rail_size = (float(rail_ends[0, 0] - rail_ends[1, 0]), 0.035, 0.04)
+        parts.append(both_sides(box(rail_size, material=bright_material, centre=mirror_centre)))
     return parts
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,12 +31,20 @@ from ssad.rendering.bodies.parts import (
     tubes,
     wheel,
 )
-from ssad.rendering.bodies.people import CLOTHS, draw_appearance, figure, seated_pose, torso_charts
+from ssad.rendering.bodies.people import (
+    CLOTHS,
+    TARGET_APPEARANCE,
+    draw_appearance,
+    figure,
+    seated_pose,
+    torso_charts,
+)
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, loft, merge, ring, sphere, tube
 
 BICYCLES = {"plain": 0.3, "city": 0.3, "racing": 0.2, "delivery": 0.2}  # variants and their shares
 MOTORCYCLES = {"naked": 0.3, "sports": 0.3, "scooter": 0.4}
 BOXED = 0.35  # share of naked motorcycles and scooters with a delivery box behind the rider
+TARGET_HELMET = (0.03, 0.03, 0.032)
 WICKER = Material("wicker", (0.24, 0.14, 0.06), specular=0.02, gloss=0.1)
 # painted parts of a motorcycle, through ovals (x, half width, lowest and highest point), m
 TANK = ((-0.18, 0.09, 0.76, 0.84), (-0.05, 0.15, 0.72, 0.94), (0.14, 0.17, 0.70, 0.98), (0.30, 0.08, 0.76, 0.90))
@@ -54,6 +63,14 @@ SMALL_MUDGUARD = (
     (0.74, 0.09, 0.46, 0.52),
     (0.90, 0.06, 0.32, 0.40),
 )
+ENGINE = ((-0.26, 0.13, 0.26, 0.50), (-0.05, 0.17, 0.22, 0.56), (0.12, 0.16, 0.24, 0.66), (0.30, 0.11, 0.30, 0.56))
+FRAME_COVER = (
+    (-0.56, 0.06, 0.64, 0.78),
+    (-0.30, 0.12, 0.46, 0.80),
+    (-0.05, 0.13, 0.48, 0.82),
+    (0.32, 0.07, 0.62, 0.86),
+)
+ENGINE_BLOCK = Material("engine", (0.045, 0.045, 0.048), specular=0.12, gloss=0.5)
 FAIRING = ((0.12, 0.24, 0.38, 0.80), (0.45, 0.22, 0.46, 1.00), (0.72, 0.13, 0.76, 1.02), (0.80, 0.05, 0.82, 0.96))
 
 
@@ -74,6 +91,8 @@ def bicycle(
     appearance = draw_appearance(generator, helmet=bool(generator.random() < 0.5), rider=True)
     random_phase, uprightness = generator.uniform(0.0, 2.0 * np.pi), float(generator.random())
     variant = _variant(BICYCLES, float(generator.random()))
+    if style == "bicyclist_target":
+        appearance, variant, uprightness = TARGET_APPEARANCE, "plain", 0.5
     # Drawn before the variant is known, so that the number of draws is fixed.
     uprightness = {"city": 1.0, "racing": 0.0}.get(variant, uprightness)
     crank = float(random_phase if phase is None else phase)
@@ -147,7 +166,7 @@ def bicycle(
         parts.append(crate((x, -0.035, z - 0.04), (x + 0.03, 0.035, z + 0.04), TAIL))
         parts.append(crate((x + 0.03, -0.04, z - 0.045), (x + 0.04, 0.04, z + 0.045), TRIM))
     charts = side_charts("frame", (-0.5 * size[0], -0.1, 0.1 * size[2]), (0.5 * size[0], 0.1, 0.75 * size[2]))
-    if style == "ridden":
+    if style != "parked":
         hand_points = [as_point(grip * [1.0, side, 1.0] + [0.0, 0.0, 0.02]) for side in (1.0, -1.0)]
         trunk_lean = {"city": 0.12, "racing": 0.85}.get(variant, 0.35 + 0.35 * (1.0 - uprightness))
         pose = seated_pose(
@@ -193,6 +212,10 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     appearance = draw_appearance(generator, helmet=True, rider=True, visor=True)
     variant = _variant(MOTORCYCLES, float(generator.random()))
     has_box = bool(generator.random() < BOXED) and variant != "sports"
+    if style == "motorcyclist_target":
+        helmet = replace(appearance.helmet or TARGET_APPEARANCE.shirt, colour=TARGET_HELMET)
+        appearance = replace(TARGET_APPEARANCE, helmet=helmet, visor=True)
+        variant, has_box = "naked", False
     # All random numbers are drawn for every variant, so that their number never depends on it.
     colour = CLOTHS[int(generator.integers(1, len(CLOTHS)))]
     segments = (4, 6, 10)[detail]
@@ -212,7 +235,7 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     if detail:
         parts.append(crates((-0.94, 0.12, 0.80), (-0.90, 0.17, 0.84), BLINKER))
     charts = side_charts("body", (-0.5 * size[0], -0.3, 0.15 * size[2]), (0.5 * size[0], 0.3, 0.9 * size[2]))
-    if style == "ridden":
+    if style != "parked":
         hand_points = [as_point(grip * [1.0, side, 1.0] + [-0.03, 0.0, 0.03]) for side in (1.0, -1.0)]
         foot_points = (
             ((0.24, 0.13, 0.33), (0.24, -0.13, 0.33)) if is_scooter else ((0.02, 0.22, 0.33), (0.02, -0.22, 0.33))
@@ -240,8 +263,9 @@ def _tyres(axles: Sequence[tuple[float, float]], radius: float, detail: int) -> 
         tyre = ring(radius, half_width, material=RUBBER, segments=segments, around=(4, 5, 8)[detail])
         parts.append(tyre.moved(x, 0.0, radius))
         if detail:
-            rim_disc = wheel(0.75 * radius, 0.07, detail=detail, rim=0.97, spokes=5)
-            parts.append(both_sides(rim_disc).moved(x, 0.0, radius))
+            # Each half keeps to its side: the inner end of one would hide the spokes of the other.
+            rim_disc = wheel(0.80 * radius, 0.04, detail=detail, rim=0.94, spokes=5)
+            parts.append(both_sides(rim_disc.moved(y=0.022)).moved(x, 0.0, radius))
     return parts
 
 
@@ -266,15 +290,22 @@ def _motorbike(segments: int, detail: int, *, fairing: bool) -> tuple[list[Mesh]
     parts.append(
         _pod([(-0.74, 0.13, 0.84, 0.94), (-0.35, 0.16, 0.78, 0.85), (-0.10, 0.12, 0.78, 0.86)], segments, TRIM)
     )
-    parts.append(_pod([(-0.28, 0.17, 0.26, 0.62), (-0.05, 0.20, 0.22, 0.70), (0.28, 0.17, 0.28, 0.66)], segments, DARK))
-    parts.append(crate((-0.05, -0.25, 0.30), (0.12, 0.25, 0.42), STEEL))
+    parts.append(_pod(ENGINE, segments, ENGINE_BLOCK))
+    parts.append(_pod(FRAME_COVER, segments, TRIM))
+    parts.append(crate((-0.06, -0.21, 0.28), (0.10, 0.21, 0.40), STEEL))
     fork_crown = np.array([0.40, 0.0, 0.95])
     side_offset = np.array([0.0, 0.09, 0.0])
     parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, segments))
+    parts.append(
+        tube(np.array([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)]), 0.04, material=FRAME, segments=segments)
+    )
     if detail:
         parts.append(
             tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, segments)
         )
+        parts.append(tubes([(-0.48, 0.10, 0.70), rear_hub + np.array([0.04, 0.10, 0.06])], 0.022, STEEL, segments))
+        for z in (0.46, 0.52, 0.58):  # cooling fins
+            parts.append(crate((0.02, -0.15, z), (0.22, 0.15, z + 0.02), STEEL))
         exhaust = [(0.15, -0.16, 0.24), (-0.45, -0.20, 0.24), (-0.82, -0.22, 0.42)]
         parts.append(tube(exhaust, [0.03, 0.045, 0.06], material=CHROME, segments=segments))
         blinker = sphere((0.03, 0.03, 0.03), material=BLINKER, centre=(0.46, 0.20, 0.90), segments=6)

@@ -36,7 +36,8 @@ CHROME = Material("chrome", (0.55, 0.55, 0.56), specular=0.5, gloss=0.85)
 STEEL = Material("steel", (0.30, 0.31, 0.32), specular=0.2, gloss=0.5)
 FRAME = Material("frame", (0.05, 0.05, 0.055), specular=0.05, gloss=0.3)
 HEAD = Material("head_lamp", (0.75, 0.77, 0.80), specular=0.12, gloss=0.95, emission=0.25)
-TAIL = Material("tail_lamp", (0.36, 0.012, 0.012), specular=0.09, gloss=0.9, emission=0.12)
+HOUSING = Material("lamp_housing", (0.045, 0.046, 0.050), specular=0.12, gloss=0.95)
+TAIL = Material("tail_lamp", (0.30, 0.010, 0.011), specular=0.09, gloss=0.9, emission=0.12)
 BLINKER = Material("indicator", (0.75, 0.26, 0.02), specular=0.09, gloss=0.9)
 PLATE = Material("plate", (0.80, 0.80, 0.78), specular=0.04, gloss=0.5)
 SOIL = Material("soil", (0.10, 0.065, 0.04), specular=0.0, gloss=0.0)
@@ -288,17 +289,15 @@ def wheel(
         return build(points, np.concatenate([around, fan]), materials=RUBBER, smooth=0.0)
     segments = 20 if detail == 2 else 10
     shoulder = min(0.18 * radius, 0.3 * width)
+    # The inner end is a plain disc, and so is what lies behind the spokes.
     tread = (
-        (rim, -half_width),
         (0.93, -half_width),
         (1.0, shoulder - half_width),
         (1.0, half_width - shoulder),
         (0.93, half_width),
-        (rim, 0.86 * half_width),
+        (rim, 0.72 * half_width),
     )
-    outline = [
-        (radius_shares * radius, depth_shares) for radius_shares, depth_shares in (*tread, (rim, 0.3 * half_width))
-    ]
+    outline = [(radius_share * radius, depth) for radius_share, depth in tread]
     tyre = lathe(outline, material=RUBBER, segments=segments, axis=1)
     disc_profile = [(rim, 0.88), (rim - 0.05, 0.80), (0.20, 0.88), (0.0, 0.92)]
     if detail == 1:
@@ -315,7 +314,8 @@ def wheel(
     )
     faces = grid_faces(len(disc_profile), segments, wrap=True)
     cells = np.arange(len(faces)) // 2
-    is_between_spokes = (cells % segments) * spokes % segments >= 0.52 * segments
+    # Ten cells around show five spokes at most.
+    is_between_spokes = (cells % segments) * spokes % segments >= 0.52 * segments if detail == 2 else cells % 2 == 1
     is_gap = is_between_spokes & (cells // segments == (1 if detail == 2 else 0))
     disc = build(
         disc_points.reshape(-1, 3), faces, materials=(steel, DARK), material=is_gap.astype(np.int32), smooth=SMOOTH

@@ -12,7 +12,7 @@ import numpy as np
 
 from ssad.core.geometry import cross
 from ssad.rendering.bodies.parts import Chart, as_point, crate, unwrap
-from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, loft, merge, sphere, tube
+from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, build, loft, merge, prism, sphere, tube
 
 SKINS = ((0.62, 0.40, 0.29), (0.50, 0.31, 0.21), (0.35, 0.20, 0.13), (0.20, 0.11, 0.07), (0.10, 0.055, 0.035))
 HAIRS = ((0.015, 0.012, 0.010), (0.05, 0.03, 0.02), (0.13, 0.075, 0.04), (0.38, 0.27, 0.14), (0.40, 0.40, 0.40))
@@ -34,6 +34,10 @@ BANDS = Material("bands", (0.62, 0.64, 0.66), specular=0.2, gloss=0.5)
 STICK = Material("stick", (0.06, 0.03, 0.015), specular=0.05, gloss=0.5)
 EYES = Material("eyes", (0.012, 0.010, 0.009), specular=0.05, gloss=0.6)
 VISOR = Material("visor", (0.012, 0.013, 0.015), specular=0.09, gloss=0.95)
+# side view of a backpack: ahead and up from its middle, as shares of the stature
+PACK_OUTLINE = np.array(
+    [(0.045, -0.10), (0.045, 0.095), (0.02, 0.11), (-0.02, 0.095), (-0.045, 0.04), (-0.048, -0.08), (-0.03, -0.105)]
+)
 LIPS = Material("lips", (0.16, 0.05, 0.045), specular=0.02, gloss=0.2)
 
 
@@ -58,6 +62,18 @@ class PersonAppearance:
     bands: Material | None = None  # reflecting bands of a high-visibility vest
     beard: bool = False
     visor: bool = False  # of a motorcycle helmet
+
+
+CHILDREN = ("child", "child_target")
+TARGETS = ("adult_target", "child_target")
+# The colours of the test targets are this project's: dark clothes over blue trousers.
+TARGET_APPEARANCE = PersonAppearance(
+    skin=Material("skin", (0.42, 0.26, 0.18), specular=0.02, gloss=0.1),
+    hair=Material("hair", (0.03, 0.02, 0.015), specular=0.02, gloss=0.1),
+    shirt=Material("shirt", (0.022, 0.022, 0.025), specular=0.02, gloss=0.1),
+    trousers=Material("trousers", (0.03, 0.05, 0.13), specular=0.02, gloss=0.1),
+    shoes=Material("shoes", (0.02, 0.02, 0.022), specular=0.02, gloss=0.1),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,59 +281,25 @@ def figure(pose: BodyPose, appearance: PersonAppearance, *, height: float, detai
     segments = (4, 6, 10)[detail]
     trunk_axis = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
     forward = cross([0.0, 1.0, 0.0], trunk_axis)
-    parts = [_trunk(pose, appearance, stature, segments=2 * segments if detail else 6, child=child)]
-    leg_material = appearance.skin if appearance.skirt else appearance.trousers
+    parts = _trunk(pose, appearance, stature, segments=2 * segments if detail else 6, child=child)
+    neck_path = [
+        pose.neck - 0.03 * stature * trunk_axis,
+        0.25 * pose.neck + 0.75 * pose.head - 0.006 * stature * forward,
+    ]
+    parts.append(tube(neck_path, np.array([0.034, 0.030]) * stature, material=appearance.skin, segments=segments))
     for index in (0, 1):
-        hip, knee, ankle, toe = pose.hips[index], pose.knees[index], pose.ankles[index], pose.toes[index]
-        shoulder, elbow, hand = pose.shoulders[index], pose.elbows[index], pose.hands[index]
-        if detail == 0:
-            sole = ankle - np.array([0.0, 0.0, 0.045 * stature])
-            parts.append(
-                tube([hip, knee, sole], np.array([0.052, 0.034, 0.030]) * stature, material=leg_material, segments=4)
-            )
-            arm_radii = np.array([0.03, 0.025, 0.02]) * stature
-            parts.append(tube([shoulder, elbow, hand], arm_radii, material=appearance.shirt, segments=4))
-            continue
-        leg_path = [hip + 0.03 * stature * trunk_axis, 0.6 * hip + 0.4 * knee, 0.1 * hip + 0.9 * knee]
-        leg_path += [0.9 * knee + 0.1 * ankle, 0.6 * knee + 0.4 * ankle, ankle]
-        leg_radii = np.array([0.050, 0.048, 0.038, 0.036, 0.034, 0.024]) * stature
-        if appearance.shorts:
-            parts.append(tube(leg_path[:3], leg_radii[:3] * 1.12, material=leg_material, segments=segments))
-            parts.append(tube(leg_path[2:], leg_radii[2:] * 0.9, material=appearance.skin, segments=segments))
-        else:
-            parts.append(tube(leg_path, leg_radii, material=leg_material, segments=segments))
-        heel = ankle - 0.28 * (toe - ankle) * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.018 * stature]
-        shoe_path = [heel, 0.5 * (ankle + toe), toe]
-        parts.append(
-            tube(shoe_path, np.array([0.022, 0.030, 0.018]) * stature, material=appearance.shoes, segments=segments)
-        )
-        wrist = 0.88 * hand + 0.12 * elbow
-        inward = np.array([0.0, -np.sign(shoulder[1] - pose.neck[1]), 0.0])
-        sleeve_path = [
-            shoulder + (0.030 * trunk_axis + 0.030 * inward) * stature,
-            shoulder + 0.006 * stature * trunk_axis,
-        ]
-        sleeve_path += [0.5 * (shoulder + elbow), elbow, wrist]
-        parts.append(
-            tube(
-                sleeve_path,
-                np.array([0.014, 0.031, 0.030, 0.025, 0.019]) * stature,
-                material=appearance.shirt,
-                segments=segments,
-            )
-        )
-        hand_radii = (0.020 * stature, 0.014 * stature, 0.030 * stature)
-        parts.append(sphere(hand_radii, material=appearance.skin, centre=as_point(hand), segments=segments))
+        parts += _leg(pose, appearance, stature, index, detail)
+        parts += _arm(pose, appearance, stature, index, detail)
     parts += _head(pose, appearance, stature, detail, 1.35 if child else 1.0)
     trunk_pose = np.eye(4)
     trunk_pose[:3, :3] = np.stack([forward, [0.0, 1.0, 0.0], trunk_axis], axis=1)
     if appearance.pack and detail > 0:
-        trunk_pose[:3, 3] = pose.pelvis + 0.62 * (pose.neck - pose.pelvis) - 0.10 * stature * forward
-        parts.append(
-            _box(
-                (0.045 * stature, 0.075 * stature, 0.11 * stature), replace(appearance.trousers, name="pack")
-            ).transformed(trunk_pose)
+        trunk_pose[:3, 3] = pose.pelvis + 0.60 * (pose.neck - pose.pelvis) - 0.10 * stature * forward
+        scaled_pack = PACK_OUTLINE * stature
+        pack = prism(
+            scaled_pack, (-0.072 * stature, 0.072 * stature), material=replace(appearance.trousers, name="pack"), axis=1
         )
+        parts.append(pack.transformed(trunk_pose))
     if appearance.bag is not None and detail > 0:  # at the right hip
         trunk_pose[:3, 3] = pose.pelvis + np.array([0.0, -0.125 * stature, 0.0]) - 0.01 * stature * forward
         parts.append(_box((0.075 * stature, 0.022 * stature, 0.055 * stature), appearance.bag).transformed(trunk_pose))
@@ -329,116 +311,304 @@ def _box(half: Point, material: Material) -> Mesh:
     return crate((-half[0], -half[1], -half[2]), half, material)
 
 
-def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segments: int, child: bool) -> Mesh:
+def _leg(pose: BodyPose, appearance: PersonAppearance, height: float, index: int, detail: int) -> list[Mesh]:
+    """Return the left (0) or right (1) leg with its shoe; it begins inside the trousers about the pelvis."""
+    hip, knee, ankle, toe = pose.hips[index], pose.knees[index], pose.ankles[index], pose.toes[index]
+    segments = (4, 6, 10)[detail]
+    material = appearance.skin if appearance.skirt else appearance.trousers
+    if detail == 0:
+        sole = ankle - np.array([0.0, 0.0, 0.045 * height])
+        radii = np.array([0.050, 0.036, 0.030]) * height
+        return [tube([hip, knee, sole], radii, material=material, segments=4)]
+    thigh = (hip - knee) / max(float(np.linalg.norm(hip - knee)), 1e-9)
+    path = [hip + 0.02 * height * thigh, 0.6 * hip + 0.4 * knee, 0.06 * hip + 0.94 * knee]
+    path += [0.88 * knee + 0.12 * ankle, 0.6 * knee + 0.4 * ankle, ankle]
+    radii = np.array([0.044, 0.048, 0.038, 0.037, 0.034, 0.029]) * height
+    if appearance.shorts:
+        parts = [
+            tube(path[:3], radii[:3] * [1.0, 1.10, 1.22], material=material, segments=segments),
+            tube(path[2:], radii[2:] * [0.9, 0.9, 0.95, 0.80], material=appearance.skin, segments=segments),
+        ]
+    else:
+        shares = [0.9, 0.9, 0.9, 0.88, 0.95, 0.80] if appearance.skirt else [1.0] * 6
+        parts = [tube(path, radii * shares, material=material, segments=segments)]
+    return [*parts, _shoe(ankle, toe, height, appearance.shoes)]
+
+
+def _shoe(ankle: F64, toe: F64, height: float, material: Material) -> Mesh:
+    """Return a shoe with a flat sole; its tip and its lowest point are those of a foot between the joints."""
+    along = (toe - ankle) * [1.0, 1.0, 0.0]
+    length = max(float(np.linalg.norm(along)), 1e-9)
+    pitch = np.array([along[0], along[1], toe[2] - ankle[2] + 0.028 * height])
+    pitch /= max(float(np.linalg.norm(pitch)), 1e-9)
+    side = cross([0.0, 0.0, 1.0], along / length)
+    up = cross(pitch, side)
+    sole = ankle - 0.046 * height * up
+    # place along the foot, half width and height of a section: heel, ankle, instep, ball, tip
+    shape = (
+        (-0.026, 0.015, 0.030),
+        (0.0, 0.021, 0.046),
+        (0.045, 0.024, 0.040),
+        (0.085, 0.026, 0.024),
+        (0.116, 0.013, 0.014),
+    )
+    outline = np.array([(-1.0, 0.0), (-0.9, 0.55), (0.0, 1.0), (0.9, 0.55), (1.0, 0.0)])
+    sections = [
+        sole + height * (place * pitch + width * outline[:, :1] * side + rise * outline[:, 1:] * up)
+        for place, width, rise in shape
+    ]
+    return loft(np.array(sections), material=material, smooth=0.9)
+
+
+def _arm(pose: BodyPose, appearance: PersonAppearance, height: float, index: int, detail: int) -> list[Mesh]:
+    """Return the left (0) or right (1) arm with its hand; the sleeve begins inside the shirt."""
+    shoulder, elbow, hand = pose.shoulders[index], pose.elbows[index], pose.hands[index]
+    segments = (4, 6, 10)[detail]
+    if detail == 0:
+        radii = np.array([0.034, 0.027, 0.02]) * height
+        return [tube([shoulder, elbow, hand], radii, material=appearance.shirt, segments=4)]
+    trunk_axis = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
+    inward = np.array([0.0, -np.sign(shoulder[1] - pose.neck[1]), 0.0])
+    path = [
+        shoulder + height * (0.050 * inward - 0.006 * trunk_axis),
+        shoulder + height * (0.018 * inward - 0.008 * trunk_axis),
+        0.76 * shoulder + 0.24 * elbow,
+        0.5 * (shoulder + elbow),
+        elbow,
+        0.88 * hand + 0.12 * elbow,
+    ]
+    radii = np.array([0.024, 0.030, 0.033, 0.030, 0.026, 0.021]) * height
+    # Circles that tilt with the path, from across the shoulder to along the arm, round the sleeve off.
+    sleeve = tube(path, radii, material=appearance.shirt, segments=segments)
+    down = (hand - elbow) / max(float(np.linalg.norm(hand - elbow)), 1e-9)
+    across = cross(down, inward)
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([across, cross(down, across), down], axis=1)
+    frame[:3, 3] = hand + 0.012 * height * down
+    palm = sphere((0.021 * height, 0.013 * height, 0.042 * height), material=appearance.skin, segments=segments)
+    return [sleeve, palm.transformed(frame)]
+
+
+# rows of the clothes: place as a share of the way from the hips to the neck, half depth and half width as shares of
+# the stature
+SHIRT = (
+    (-0.05, 0.072, 0.108),
+    (0.16, 0.066, 0.096),
+    (0.32, 0.061, 0.087),
+    (0.62, 0.070, 0.103),
+    (0.80, 0.067, 0.112),
+    (0.92, 0.056, 0.100),
+    (1.00, 0.040, 0.056),
+    (1.10, 0.036, 0.038),
+)
+TROUSERS = ((-0.26, 0.036, 0.052), (-0.12, 0.066, 0.095), (0.08, 0.064, 0.093))
+BAND_ROWS = (0.06, 0.42)  # of reflecting bands, which are as wide as `BAND_WIDTH`
+BAND_WIDTH = 0.10
+
+
+def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segments: int, child: bool) -> list[Mesh]:
+    """Return the trousers or skirt about the hips, and over them the shirt or coat."""
     trunk_axis = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
     forward = cross([0.0, 1.0, 0.0], trunk_axis)
     length = float(np.linalg.norm(pose.neck - pose.pelvis))
-    is_long = appearance.coat or appearance.skirt
-    rows = [
-        (-0.16, 0.050, 0.070),
-        (0.06, 0.066, 0.092),
-        (0.16, 0.064, 0.089),
-        (0.30, 0.060, 0.083),
-        (0.62, 0.070, 0.104),
-        (0.86, 0.062, 0.112),
-        (0.97, 0.038, 0.060),
-        (1.03, 0.026, 0.028),
-        (1.12, 0.026, 0.028),
-    ]
-    if is_long:  # the hem goes round both thighs
-        stride_share = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / height
-        rows = [(-0.60, 0.062 + 0.9 * stride_share, 0.118), (0.0, 0.076 + 0.3 * stride_share, 0.118), *rows[2:]]
-    if appearance.bands is not None:  # the upper band has rows of its own
-        band_row = next(row_index for row_index, entry in enumerate(rows) if entry[0] > 0.52)
-        rows[band_row:band_row] = [(0.42, 0.064, 0.091), (0.52, 0.067, 0.097)]
-    if child:
-        rows = [(station, 1.12 * half_depth, half_width) for station, half_depth, half_width in rows]
+    shirt_rows, trouser_rows = list(SHIRT), list(TROUSERS)
+    stride_share = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / height
+    hem = [(-0.62, 0.066 + 0.9 * stride_share, 0.120), (-0.30, 0.070 + 0.45 * stride_share, 0.112)]  # round both thighs
+    if appearance.coat:
+        shirt_rows[:1] = [*hem, (0.0, 0.078 + 0.2 * stride_share, 0.108)]
+    if appearance.skirt:
+        trouser_rows[:2] = [*hem, (-0.05, 0.069, 0.100)]
+    if appearance.bands is not None:
+        places, *profile = np.array(shirt_rows).T
+        edges = [edge for row in BAND_ROWS for edge in (row, row + BAND_WIDTH)]
+        half_depths, half_widths = profile
+        band_rows = [
+            (edge, float(np.interp(edge, places, half_depths)), float(np.interp(edge, places, half_widths)))
+            for edge in edges
+        ]
+        shirt_rows = sorted({round(row[0], 6): row for row in (*shirt_rows, *band_rows)}.values())
+    depth_share = 1.12 if child else 1.0
     angles = np.arange(segments) * (2.0 * np.pi / segments)
     left_axis = np.array([0.0, 1.0, 0.0])
-    sections = [
-        pose.pelvis
-        + station * length * (trunk_axis if station > 0 else np.array([0.0, 0.0, 1.0]))
-        + height * (half_depth * np.cos(angles)[:, None] * forward + half_width * np.sin(angles)[:, None] * left_axis)
-        for station, half_depth, half_width in rows
-    ]
-    body = loft(np.array(sections), material=appearance.shirt, smooth=1.0)
-    face_centres = body.corners().mean(axis=1) - pose.pelvis
-    face_rows = np.minimum(np.arange(len(body.faces)) // (2 * segments), len(rows))  # caps come last
-    first_shirt_row = 0 if appearance.coat else 2 - int(is_long)
-    is_front = face_centres @ forward >= 0.0
-    is_neck = face_rows >= len(rows) - 2
-    is_shirt = (face_rows >= first_shirt_row) & (face_rows < len(rows) - 1)
-    material = np.where(is_neck, 2, np.where(is_shirt, 0, 1))
-    materials = [appearance.shirt, appearance.trousers, appearance.skin]
-    is_jacket = is_shirt & ~is_neck
+
+    def wrap(rows: list[tuple[float, float, float]], material: Material) -> Mesh:
+        sections = [
+            pose.pelvis
+            + station * length * (trunk_axis if station > 0 else np.array([0.0, 0.0, 1.0]))
+            + height
+            * (
+                depth_share * half_depth * np.cos(angles)[:, None] * forward
+                + half_width * np.sin(angles)[:, None] * left_axis
+            )
+            for station, half_depth, half_width in rows
+        ]
+        return loft(np.array(sections), material=material, smooth=1.0)
+
+    shirt = wrap(shirt_rows, appearance.shirt)
+    face_centres = shirt.corners().mean(axis=1) - pose.pelvis
+    face_rows = np.arange(len(shirt.faces)) // (2 * segments)  # caps come last
+    is_side = face_rows < len(shirt_rows) - 1
+    material = np.zeros(len(shirt.faces), np.int32)
+    materials = [appearance.shirt]
     if appearance.bands is not None:
-        band_rows = [row_index for row_index, entry in enumerate(rows) if entry[0] in (0.06, 0.42)]
-        material[is_jacket & np.isin(face_rows, band_rows)] = len(materials)
+        lower_edges = np.array([row[0] for row in shirt_rows])
+        band_faces = [
+            np.isin(face_rows, np.flatnonzero((lower_edges > row - 1e-6) & (lower_edges < row + BAND_WIDTH - 1e-6)))
+            for row in BAND_ROWS
+        ]
+        material[is_side & np.any(band_faces, axis=0)] = len(materials)
         materials.append(appearance.bands)
     if (
         appearance.inner is not None and segments > 6
     ):  # a strip down the middle of the chest, 30 degrees to either side at most
-        face_columns = np.arange(len(body.faces)) // 2 % segments
+        face_columns = np.arange(len(shirt.faces)) // 2 % segments
         is_middle = np.minimum(face_columns, segments - 1 - face_columns) == 0
-        material[is_jacket & is_middle & (face_rows < len(rows))] = len(materials)
+        material[is_side & is_middle] = len(materials)
         materials.append(appearance.inner)
-    panel = np.where(is_shirt & ~is_neck, np.where(is_front, 0, 1), -1).astype(np.int32)
-    return replace(
-        body,
-        material=material.astype(np.int32),
-        materials=tuple(materials),
-        panel=panel,
-        panels=("torso_front", "torso_back"),
+    panel = np.where(is_side, np.where(face_centres @ forward >= 0.0, 0, 1), -1).astype(np.int32)
+    shirt = replace(
+        shirt, material=material, materials=tuple(materials), panel=panel, panels=("torso_front", "torso_back")
     )
+    return [shirt, wrap(trouser_rows, appearance.trousers)]
+
+
+# rows of a head: height above its middle, front, back and half width, as shares of the stature
+HEAD = (
+    (-0.064, 0.036, 0.004, 0.014),
+    (-0.054, 0.045, -0.012, 0.026),
+    (-0.034, 0.047, -0.036, 0.036),
+    (-0.010, 0.046, -0.047, 0.041),
+    (0.008, 0.044, -0.052, 0.042),
+    (0.026, 0.049, -0.055, 0.043),
+    (0.044, 0.045, -0.053, 0.040),
+    (0.057, 0.032, -0.043, 0.031),
+    (0.065, 0.012, -0.022, 0.013),
+)
+HEAD_ROWS = ((0, 2, 4, 6, 8), (0, 1, 2, 3, 4, 5, 6, 7, 8), (0, 1, 2, 3, 4, 5, 6, 7, 8))
+WHITES = Material("sclera", (0.45, 0.43, 0.41), specular=0.04, gloss=0.5)
+
+
+def _skull(appearance: PersonAppearance, detail: int) -> Mesh:
+    """Return a head about the origin for a stature of 1 m: skin, beard, and hair or a cap, which stand out."""
+    columns = (6, 8, 14)[detail]
+    rows = np.array([HEAD[index] for index in HEAD_ROWS[detail]])
+    # Half a step off: a column looks straight ahead.
+    angles = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
+    cosine, sine = np.cos(angles), np.sin(angles)
+    middle = -0.004
+    half_depth = np.where(cosine > 0.0, rows[:, 1:2] - middle, middle - rows[:, 2:3])
+    sections = np.stack(
+        [middle + half_depth * cosine, rows[:, 3:4] * sine, np.broadcast_to(rows[:, :1], half_depth.shape)], axis=-1
+    )
+    # lower edge of the hair ahead, at the sides and behind; of a cap all round
+    face_angles = np.abs(np.angle(np.exp(1j * (np.arange(columns) + 1.0) * (2.0 * np.pi / columns))))
+    back_edge = -0.066 if appearance.long_hair else -0.060 if appearance.helmet else -0.045
+    edges = np.interp(face_angles, [0.0, 0.7, 1.0, 1.7, 2.2], [0.040, 0.040, 0.006, -0.004, back_edge])
+    covering = appearance.hair
+    if appearance.helmet is not None:
+        edges = np.maximum(edges, np.where(face_angles < 1.2, 1.0, edges))
+    heights = 0.5 * (rows[:-1, 0] + rows[1:, 0])
+    is_hair = heights[:, None] > edges
+    is_cap = np.zeros_like(is_hair)
+    if appearance.cap is not None and appearance.helmet is None:
+        is_cap = np.broadcast_to(heights[:, None] > 0.030, is_hair.shape)
+    is_beard = np.zeros_like(is_hair)
+    if appearance.beard and detail > 0:
+        is_beard = (heights[:, None] < -0.030) & (face_angles < 1.6)
+    # A vertex stands out where all cells about it are covered.
+    covered = is_hair | is_cap
+    padded = np.concatenate([covered[:1], covered, covered[-1:]])
+    stands_out = padded[:-1] & padded[1:] & np.roll(padded[:-1], 1, axis=1) & np.roll(padded[1:], 1, axis=1)
+    centre = np.array([middle, 0.0, 0.0])
+    sections = np.where(stands_out[..., None], centre + (sections - centre) * [1.07, 1.08, 1.09], sections)
+    skull = loft(sections, material=appearance.skin, smooth=1.4)
+    cell_material = np.where(is_cap, 2, np.where(is_hair | is_beard, 1, 0))
+    materials = (appearance.skin, covering, appearance.cap or covering)
+    crown = cell_material[-1].max()
+    material = np.concatenate([np.repeat(cell_material.ravel(), 2), [0] * (columns - 2), [crown] * (columns - 2)])
+    return replace(skull, material=material.astype(np.int32), materials=materials)
+
+
+def _facial_features(appearance: PersonAppearance, detail: int) -> Mesh:
+    """Return eyes under their brows, nose and mouth, for a head about the origin and a stature of 1 m."""
+    points: list[tuple[float, float, float]] = []
+    faces: list[tuple[int, int, int]] = []
+    material: list[int] = []
+    # The face is as flat as a column of the head is wide.
+    front = 0.0435 if detail == 1 else 0.0455
+
+    def plate(
+        middle: tuple[float, float], half: tuple[float, float], ahead: float, colour: int, slope: float = 0.0
+    ) -> None:
+        """Add a rectangle across the face, swept back at its outer end."""
+        (y, z), (half_width, half_height) = middle, half
+        outer = np.sign(y) * half_width
+        first = len(points)
+        for across, up in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            place = y + across * half_width
+            depth = front + ahead - 6.0 * place * place
+            points.append((depth, place, z + up * half_height + (slope if across * outer > 0 else 0.0)))
+        faces.extend([(first, first + 1, first + 2), (first, first + 2, first + 3)])
+        material.extend([colour, colour])
+
+    for side in (1.0, -1.0):
+        if detail == 2:
+            plate((side * 0.0175, 0.0085), (0.0078, 0.0034), 0.0015, 2)
+            plate((side * 0.0170, 0.0085), (0.0032, 0.0034), 0.0025, 0)
+        else:
+            plate((side * 0.0175, 0.0085), (0.0070, 0.0034), 0.0025, 0)
+        plate((side * 0.0180, 0.0180), (0.0092, 0.0018), 0.0035, 3, -0.001)
+    plate((0.0, -0.0330), (0.0125, 0.0026), 0.0040, 1)
+    first = len(points)
+    points += [
+        (front, 0.0, 0.010),
+        (front + 0.0145, 0.0, -0.013),
+        (front - 0.001, 0.009, -0.018),
+        (front - 0.001, -0.009, -0.018),
+    ]
+    faces += [(first, first + 1, first + 3), (first, first + 2, first + 1), (first + 1, first + 2, first + 3)]
+    material += [4, 4, 4]
+    lips = replace(LIPS, colour=_mixed(LIPS.colour, appearance.skin.colour, 0.4))
+    brows = replace(appearance.hair, name="brows", colour=_mixed(appearance.hair.colour, (0.0, 0.0, 0.0), 0.3))
+    materials = (EYES, lips, WHITES, brows, appearance.skin)
+    return build(points, faces, materials=materials, material=material, smooth=0.9)
+
+
+def _mixed(
+    first: tuple[float, float, float], second: tuple[float, float, float], share: float
+) -> tuple[float, float, float]:
+    """Return a colour between two: the share of the second."""
+    return as_point((1.0 - share) * np.array(first) + share * np.array(second))
 
 
 def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, size_share: float) -> list[Mesh]:
-    x, y, z = (float(value) for value in pose.head)
-    default_segments = (6, 8, 14)[detail]
     scale = size_share * height
 
-    def ellipsoid(
-        half_axes: Point, material: Material, ahead: float = 0.0, up: float = 0.0, segments: int = default_segments
-    ) -> Mesh:
+    def ellipsoid(half_axes: Point, material: Material, ahead: float = 0.0, up: float = 0.0, segments: int = 6) -> Mesh:
         """Return an ellipsoid in units of the head's size, at a place in the frame of the head."""
-        half_depth, half_width, half_height = half_axes
-        centre = (x + ahead * scale, y, z + up * scale)
-        return sphere(
-            (half_depth * scale, half_width * scale, half_height * scale),
-            material=material,
-            centre=centre,
-            segments=segments,
-        )
+        return sphere(half_axes, material=material, centre=(ahead, 0.0, up), segments=segments)
 
-    parts = [ellipsoid((0.050, 0.042, 0.064), appearance.skin)]
+    segments = (6, 8, 14)[detail]
+    parts = [_skull(appearance, detail)]
+    if detail > 0 and not appearance.visor:
+        parts.append(_facial_features(appearance, detail))
     if appearance.helmet is not None and appearance.visor:
-        parts.append(ellipsoid((0.068, 0.060, 0.066), appearance.helmet, -0.006, 0.012))
+        parts.append(ellipsoid((0.068, 0.060, 0.066), appearance.helmet, -0.006, 0.012, segments))
         if detail > 0:
-            parts.append(ellipsoid((0.030, 0.050, 0.020), VISOR, 0.038, 0.012, segments=8))
+            parts.append(ellipsoid((0.030, 0.050, 0.020), VISOR, 0.038, 0.012, 8))
     elif appearance.helmet is not None:  # the rim lies above the eyes
-        parts.append(ellipsoid((0.050, 0.048, 0.050), appearance.hair, -0.018, 0.004))
-        parts.append(ellipsoid((0.066, 0.058, 0.044), appearance.helmet, -0.006, 0.044))
+        parts.append(ellipsoid((0.067, 0.056, 0.046), appearance.helmet, -0.008, 0.038, segments))
         if appearance.cap is not None and detail > 0:  # the peak of a safety helmet
-            parts.append(ellipsoid((0.036, 0.044, 0.008), appearance.cap, 0.054, 0.032, segments=6))
+            parts.append(ellipsoid((0.036, 0.044, 0.006), appearance.cap, 0.052, 0.030))
     else:
-        parts.append(ellipsoid((0.050, 0.048, 0.056), appearance.hair, -0.016, 0.016))
         if appearance.long_hair and detail > 0:
-            parts.append(ellipsoid((0.030, 0.042, 0.070), appearance.hair, -0.030, -0.035))
-        if appearance.cap is not None:  # the peak points ahead
-            parts.append(ellipsoid((0.056, 0.051, 0.042), appearance.cap, -0.006, 0.034))
-            if detail > 0:
-                parts.append(ellipsoid((0.040, 0.040, 0.008), appearance.cap, 0.058, 0.026, segments=6))
-    if detail > 0:  # the face: eyes under their brows, nose, mouth or beard
-        parts.append(ellipsoid((0.016, 0.030, 0.008), EYES, 0.038, 0.008, segments=6))
-        parts.append(ellipsoid((0.014, 0.009, 0.014), appearance.skin, 0.049, -0.009, segments=6))
-        if appearance.beard:
-            parts.append(ellipsoid((0.026, 0.034, 0.026), appearance.hair, 0.022, -0.042, segments=6))
-        elif detail == 2:
-            parts.append(ellipsoid((0.012, 0.016, 0.005), LIPS, 0.036, -0.031, segments=6))
-    if detail == 2:
-        neck = [pose.neck - np.array([0.0, 0.0, 0.02 * height]), pose.head - [0.01 * height, 0.0, 0.02 * height]]
-        parts.append(tube(neck, 0.030 * height, material=appearance.skin, segments=8))
-    return parts
+            parts.append(ellipsoid((0.024, 0.042, 0.060), appearance.hair, -0.040, -0.045, 8))
+        if appearance.cap is not None and detail > 0:  # the peak points ahead
+            parts.append(ellipsoid((0.040, 0.036, 0.005), appearance.cap, 0.058, 0.031))
+    frame = np.diag([scale, scale, scale, 1.0])
+    frame[:3, 3] = pose.head
+    return [part.transformed(frame) for part in parts]
 
 
 def _sole(pose: BodyPose, height: float) -> float:
@@ -469,7 +639,11 @@ def _extent(pose: BodyPose, height: float) -> F64:
 
 def _pose(style: str, height: float, phase: float, swing: float, spread: float) -> BodyPose:
     """Return one moment of the walking cycle of a style (see `walking_pose`)."""
-    walker = walking_pose(height, phase=phase, swing=swing, spread=spread, child=style == "child")
+    is_child = style in CHILDREN
+    walker = walking_pose(height, phase=phase, swing=swing, spread=spread, child=is_child)
+    if style in TARGETS:  # only the legs of a test target move
+        still = walking_pose(height, phase=0.0, swing=0.0, spread=spread, child=is_child)
+        return replace(walker, elbows=still.elbows, hands=still.hands)
     if style == "elderly":
         walker = stooped_pose(walker, angle=0.32, height=height)
         shoulder = walker.shoulders[1]
@@ -518,6 +692,8 @@ def _dress_for_style(appearance: PersonAppearance, style: str, share: float) -> 
         )
     if style == "stroller":
         return replace(appearance, bag=None)
+    if style in TARGETS:
+        return TARGET_APPEARANCE
     return appearance
 
 
@@ -538,7 +714,7 @@ def pedestrian(
     appearance = draw_appearance(generator)
     random_phase, variation = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
     appearance = _dress_for_style(appearance, style, variation)
-    is_child, is_still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
+    is_child, is_still = style in CHILDREN, style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if is_still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))
 

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from ssad.rendering.bodies.parts import DARK, GLASS, HEAD, PAINT, SEAM, TAIL, TRIM, Chart, curve
+from ssad.rendering.bodies.parts import DARK, GLASS, HEAD, HOUSING, PAINT, SEAM, TAIL, TRIM, Chart, curve
 from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, build, merge
 
 Keys = tuple[tuple[float, float], ...]
@@ -22,7 +22,7 @@ Span = tuple[float, float]
 # points of a half section
 B0, B1, B2, B3, S1, S2, S3, S4, S5, U0, U1, U2, U3, T1, T2, T3 = range(16)
 SIDE = (0.12, 0.34, 0.56, 0.76, 0.90)  # S1 to S5: share of the way from the sill to the belt line
-POINTS = {2: tuple(range(16)), 1: (B0, B3, S2, S3, S4, U0, U2, T1, T3), 0: (B3, U0, U3)}
+POINTS = {2: tuple(range(1, 16)), 1: (B0, B3, S2, S3, S4, U0, U2, T1, T3), 0: (B3, U0, U3)}
 END = 0.55  # share of the bulge of the ends that is left at their upper edge
 
 
@@ -270,7 +270,7 @@ def _flank(
 ) -> tuple[Material, str | None]:
     """Material and panel of the side below the belt line."""
     if t < 0.035 and low >= shell.lamps[0] and high <= shell.lamps[1]:
-        return HEAD, None
+        return HOUSING, None
     if t > 0.968 and low >= shell.tail_lamps[0] and high <= shell.tail_lamps[1]:
         return TAIL, None
     if any(edge <= t < edge + 0.0023 for _, start, end in shell.doors for edge in (start, end)) and low >= S1:

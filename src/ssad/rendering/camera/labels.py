@@ -18,8 +18,9 @@ from ssad.core.errors import ConfigError
 from ssad.core.types import F64, I32
 from ssad.rendering.camera.kernels import raster
 from ssad.rendering.camera.kernels.labels import cover
-from ssad.rendering.camera.render import FACE_LANES, NEAR, Rendering, View
+from ssad.rendering.camera.render import Rendering, View
 from ssad.rendering.camera.scene import RenderScene, SceneObject
+from ssad.rendering.camera.visibility import FACE_LANES, NEAR
 
 CROP = 64  # pixels a side of a crop
 BEYOND = 2.0  # parts further outside than this many widths or heights of the image do not count

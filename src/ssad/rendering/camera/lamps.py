@@ -2,14 +2,19 @@
 
 A lamp lights a plane across its axis evenly: an ellipse, or the rectangle that it projects. So its power spreads
 over the lit plane at any distance, and one model covers head lamps, street lamps, projectors, flashlights and
-lasers. Irradiance over pi of one lux is about 1/60, on the scale on which the sun at noon is 2.6.
+lasers. Only the low beam of vehicles has a pattern. Irradiance over pi of one lux is about 1/60, on the scale on which
+the sun at noon is 2.6.
+
+Lamps of vehicles have the intensities of UN Regulations: low beam No. 112 (class B), stop lamps and position lamps No.
+7, indicators No. 6.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -17,6 +22,7 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, I32
+from ssad.rendering.camera import street_lighting
 from ssad.rendering.camera.kernels import light as kernels
 
 if TYPE_CHECKING:
@@ -24,15 +30,26 @@ if TYPE_CHECKING:
     from ssad.rendering.camera.scene import ObjectTable, RenderScene
 
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
+TO_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB
+NIGHT_LUX = 1.0 / 60.0  # irradiance over pi of one lux at night; basis of the lamps of street and vehicles
 LAMP_NEAR = 0.05  # m: nearer surfaces cast no shadow (the lamp's own housing)
 HEAD_LAMPS = (7.0, (0.60, 0.06), (1.0, 0.97, 0.90), 60.0, 0.055)  # power, spread, colour, reach (m), tilt (rad)
 TAIL_LAMPS = (0.25, (1.6, 1.0), (1.0, 0.05, 0.03), 8.0, 0.0)
+BRAKE_RATIO = 100.0 / 8.0  # of the light of stop lamps to that of position lamps: 100 and 8 cd
+BEAM_CANDELA = 12000.0  # largest intensity of a low beam
+BEAM_HEIGHT = 0.65  # m
+BEAM_REACH, OWN_BEAM_REACH = 70.0, 120.0  # m, of other vehicles and of the one that carries the camera
+BEAM_COLOUR = (1.0, 0.97, 0.90)
 STREET_LAMP = (26.0, (2.4, 1.7), (1.0, 0.86, 0.66), 28.0)
 LIT_UP_TO = 130.0  # m from the eye up to which lamps of bodies and of the street are on
 SHADED_UP_TO = 60.0  # m: the same for bodies that occlude the sky from the ground
 NOSE = 3.7  # m from the rear axle of a car to its front
 FLAT = 0.25  # m: lower bodies do not occlude the sky from the ground
+BEAM_SPREAD = (float(kernels.BEAM_EDGE), float(kernels.BEAM_EDGE))
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # a lamp that looks along x
+
+
+Pattern = Literal["even", "low_beam", "head_lamp"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +66,8 @@ class SceneLamp:
         square: Whether it lights a rectangle; else an ellipse.
         reach: m; light fades in the last third and ends here.
         shadows: Whether bodies and street block its light.
+        pattern: How its light is spread: "even"; "low_beam": as that of both head lamps of a vehicle in right-hand
+            traffic, with the spread `BEAM_SPREAD`; "head_lamp": even, or a low beam with the effect `low-beams`.
         texture: Index of the texture that it projects, -1 for none. The image is then a linear function of that
             texture (see `ssad.rendering.camera.texture`): u across, v down its spread. A projector lights a rectangle.
     """
@@ -62,6 +81,7 @@ class SceneLamp:
     reach: float = 80.0
     shadows: bool = True
     texture: int = -1
+    pattern: Pattern = "even"
 
     def __post_init__(self) -> None:
         numbers = (self.power, *self.spread, *self.colour, self.soft, self.reach)
@@ -69,6 +89,10 @@ class SceneLamp:
             raise ConfigError("a lamp needs a pose [4, 4] and finite numbers")
         if min(self.power, *self.colour) < 0.0 or min(*self.spread, self.reach) <= 0.0 or not 0.0 <= self.soft <= 1.0:
             raise ConfigError("a lamp: power and colour from 0, spread and reach above 0, soft from 0 to 1")
+        if self.pattern not in get_args(Pattern):
+            raise ConfigError(f"a lamp has the pattern {', '.join(get_args(Pattern))}, not {self.pattern!r}")
+        if self.pattern == "low_beam" and (self.is_square or tuple(self.spread) != BEAM_SPREAD):
+            raise ConfigError(f"a low beam has the spread {BEAM_SPREAD}, is no rectangle and projects no texture")
 
     @property
     def is_square(self) -> bool:
@@ -76,22 +100,81 @@ class SceneLamp:
         return self.square or self.texture >= 0
 
     def area(self) -> float:
-        """Lit area of a plane 1 m ahead, m^2; where the light fades, weighted by it."""
+        """Lit area of a plane 1 m ahead, m^2; where the light fades, weighted by it. Of a low beam: solid angle."""
         across, down = self.spread
+        if self.pattern == "low_beam":
+            return beam_solid_angle()
         if self.is_square:
             return 4.0 * across * down
         return float(np.pi * across * down * (1.0 + (1.0 - self.soft) ** 2) / 2.0)
 
 
+@lru_cache(maxsize=1)
+def beam_solid_angle() -> float:
+    """Return the integral of the relative intensity of a low beam over all directions, sr."""
+    tangents = np.linspace(-BEAM_SPREAD[0], BEAM_SPREAD[0], 1401)
+    across, down = np.meshgrid(tangents, tangents)
+    # An area on the plane 1 m ahead covers a solid angle that falls with the cube of the secant.
+    secants = np.sqrt(1.0 + across**2 + down**2)
+    return float((beam_shape(across, down) / secants**3).sum() * (tangents[1] - tangents[0]) ** 2)
+
+
+def beam_shape(across: F64, down: F64) -> F64:
+    """Return the relative intensity of a low beam towards directions, as `kernels.light.low_beam` has it.
+
+    Args:
+        across: Tangents of the directions to the right.
+        down: Tangents downwards, of the same shape.
+    """
+    right, up = np.degrees(np.arctan(across)), -np.degrees(np.arctan(down))
+    above = up + 0.57 - np.minimum(0.268 * np.maximum(right, 0.0), 1.1)
+    edge = np.clip(0.5 - 2.5 * above, 0.0, 1.0)
+    edge = edge * edge * (3.0 - 2.0 * edge)
+    fade = np.clip((BEAM_SPREAD[0] - np.hypot(across, down)) / 0.15, 0.0, 1.0)
+    wide = fade * np.exp(-0.5 * right**2 / 484.0)
+    below = np.minimum(above, 0.0)
+    hot = np.exp(-0.5 * right**2 / 49.0) * np.exp(below / 3.0)
+    glare = 0.018 * wide * np.exp(-0.25 * np.maximum(above, 0.0))
+    return np.asarray(glare + edge * (hot + 0.12 * wide * np.exp(below / 8.0)), np.float64)
+
+
 def own_lamps(vehicle: F64, weather: SceneWeather) -> tuple[SceneLamp, ...]:
     """Return the low beam of the vehicle that carries the camera, which is not drawn itself; none by day.
+
+    The effect `low-beams` gives it its pattern (see `with_low_beams`).
 
     Args:
         vehicle: Vehicle to world [4, 4]: x forward, z up, on the ground, `NOSE` m behind its front.
         weather: Weather that decides how bright lamps are.
     """
     strength = lamp_strength(weather.sun_height)
-    return (_beam(vehicle @ upright_pose(NOSE, 0.0, 0.0, 0.65), HEAD_LAMPS, strength),) if strength > 0.0 else ()
+    pose = vehicle @ upright_pose(NOSE, 0.0, 0.0, BEAM_HEIGHT)
+    return (_beam(pose, HEAD_LAMPS, strength),) if strength > 0.0 else ()
+
+
+def low_beam(pose: F64, strength: float, reach: float) -> SceneLamp:
+    """Return both head lamps of a vehicle as one lamp with the pattern of a low beam.
+
+    Args:
+        pose: Frame in the middle of the lamps that looks along x [4, 4].
+        strength: How bright lamps are, 0 to 1.
+        reach: m.
+    """
+    power = 2.0 * BEAM_CANDELA * beam_solid_angle() * NIGHT_LUX * strength / float(BEAM_COLOUR @ TO_LUMINANCE)
+    return SceneLamp(pose @ AHEAD, power, BEAM_SPREAD, BEAM_COLOUR, 0.0, False, reach, False, pattern="low_beam")
+
+
+def with_low_beams(lamps: Sequence[SceneLamp]) -> tuple[SceneLamp, ...]:
+    """Return lamps with the pattern of a low beam on those that are head lamps."""
+    return tuple(_with_low_beam(lamp) if lamp.pattern == "head_lamp" else lamp for lamp in lamps)
+
+
+def _with_low_beam(lamp: SceneLamp) -> SceneLamp:
+    power, *_, tilt = HEAD_LAMPS
+    frame = lamp.pose.copy()
+    # The pattern has its cut-off below a level axis, in place of the tilt of an even light.
+    frame[:3, :3] = frame[:3, :3] @ _downward_rotation(-tilt) @ AHEAD[:3, :3].T
+    return low_beam(frame, lamp.power / power, OWN_BEAM_REACH)
 
 
 def lamp_strength(sun_height: float) -> float:
@@ -100,7 +183,13 @@ def lamp_strength(sun_height: float) -> float:
 
 
 def nearby_lights(
-    scene: RenderScene, views: Sequence[View], bodies: ObjectTable, *, lamps: bool = True, contact: bool = True
+    scene: RenderScene,
+    views: Sequence[View],
+    bodies: ObjectTable,
+    *,
+    lamps: bool = True,
+    contact: bool = True,
+    low_beams: bool = False,
 ) -> Any:
     """Build lamps and occluders of B views with their grids for the kernels, without shadow maps.
 
@@ -110,10 +199,11 @@ def nearby_lights(
         bodies: The objects of the views.
         lamps: Whether lamps of the street and of bodies are lit at dusk and night, too.
         contact: Whether bodies occlude the sky from the ground.
+        low_beams: Whether the head lamps of bodies have the pattern of a low beam.
     """
     light_tables = kernels.Near()
     tables = {
-        "lamp": (kernels.Lamp, _lamps(scene, views, bodies) if lamps else _own_lamps(views)),
+        "lamp": (kernels.Lamp, _lamps(scene, views, bodies, low_beams=low_beams) if lamps else _own_lamps(views)),
         "occluder": (
             kernels.Occluder,
             _occluders(scene, views, bodies) if contact else _empty_struct(kernels.Occluder),
@@ -150,30 +240,38 @@ def _own_lamps(views: Sequence[View]) -> Rows:
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
 
 
-def _lamps(scene: RenderScene, views: Sequence[View], bodies: ObjectTable) -> Rows:
+def _lamps(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, *, low_beams: bool) -> Rows:
     """Return the lamps of views, and at dusk and night the lit lamps of the street and of bodies."""
     tables = [_own_lamps(views)]
     strength = np.array([lamp_strength(view_index.weather.sun_height) for view_index in views])
     eye_positions = np.array([view_index.pose[:2, 3] for view_index in views])
     dark_views = np.flatnonzero(strength > 0.0)
-    if len(dark_views):
-        street_rows, circles = scene.compute_once("street lamps", lambda: _fixed_lamps(_street_lamps(scene)))
-        offsets = circles[None, :, :2] - eye_positions[dark_views, None]
-        dark_index, lamp_index = np.nonzero(np.hypot(*np.moveaxis(offsets, -1, 0)) < LIT_UP_TO)
+    for lighting in sorted({views[view_index].weather.lighting for view_index in dark_views.tolist()}):
+        lit_views = dark_views[[views[view_index].weather.lighting == lighting for view_index in dark_views.tolist()]]
+        street_rows, circles = scene.compute_once(
+            ("street lamps", lighting), partial(_street_lamp_rows, scene, lighting)
+        )
+        offsets = circles[None, :, :2] - eye_positions[lit_views, None]
+        lit_index, lamp_index = np.nonzero(np.hypot(*np.moveaxis(offsets, -1, 0)) < LIT_UP_TO)
         rows = street_rows[lamp_index]
-        rows["light"] *= strength[dark_views[dark_index], None]
+        rows["light"] *= strength[lit_views[lit_index], None]
         tables.append(
-            (rows, np.column_stack([dark_views[dark_index], offsets[dark_index, lamp_index], circles[lamp_index, 2]]))
+            (rows, np.column_stack([lit_views[lit_index], offsets[lit_index, lamp_index], circles[lamp_index, 2]]))
         )
     is_shining = bodies.lit & (strength[bodies.view] > 0.0)
     is_shining &= np.hypot(*(bodies.pose[:, :2, 3] - eye_positions[bodies.view]).T) < LIT_UP_TO
     view_index, pose = bodies.view[is_shining], bodies.pose[is_shining]
-    mesh_tables, row_index, owner = _rows_of_meshes(bodies.mesh[is_shining], lambda mesh: _cached_beams(scene, mesh))
+    mesh_tables, row_index, owner = _rows_of_meshes(
+        bodies.mesh[is_shining], lambda mesh: _cached_beams(scene, mesh, low_beams=low_beams)
+    )
     if len(row_index):
         rows, circles = (
             np.concatenate([mesh_table[column] for mesh_table in mesh_tables])[row_index] for column in (0, 1)
         )
         view_index, pose = view_index[owner], pose[owner]
+        # In the frame of the body, lamps at its rear look backwards.
+        is_stop_lamp = (rows["ahead"][:, 0] < 0.0) & (bodies.signals[is_shining][owner] & kernels.BRAKING > 0)
+        rows["light"] *= np.where(is_stop_lamp, BRAKE_RATIO, 1.0)[:, None]
         # Cached rows are in the body's frame: rotate them, then shift the position.
         for name in ("across", "down", "ahead", "place"):
             rows[name] = np.einsum("nij,nj->ni", pose[:, :3, :3], rows[name])
@@ -200,9 +298,11 @@ def _rows_of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows],
     return tables, first_rows + np.arange(len(owners)) - (np.cumsum(row_counts) - row_counts)[owners], owners
 
 
-def _cached_beams(scene: RenderScene, mesh: int) -> Rows:
+def _cached_beams(scene: RenderScene, mesh: int, *, low_beams: bool) -> Rows:
     """Return the lamps of a body in its own frame, with their circles; cached."""
-    return scene.compute_once(("lamps", mesh), lambda: _fixed_lamps(_beams(scene, mesh)))  # type: ignore[no-any-return]
+    return scene.compute_once(  # type: ignore[no-any-return]
+        ("lamps", mesh, low_beams), lambda: _fixed_lamps(_beams(scene, mesh, low_beams=low_beams))
+    )
 
 
 def _fixed_lamps(lamps: Sequence[SceneLamp]) -> Rows:
@@ -212,17 +312,33 @@ def _fixed_lamps(lamps: Sequence[SceneLamp]) -> Rows:
     return rows, np.array(circles, np.float64).reshape(-1, 3)
 
 
-def _street_lamps(scene: RenderScene) -> list[SceneLamp]:
-    """Return the lamps of the street."""
+def _street_lamp_rows(scene: RenderScene, lighting: str) -> Rows:
+    """Return the rows of the lamps of the street, with the circles [N, 3] that contain their light."""
+    rows, circles = _fixed_lamps(_street_lamps(scene, lighting))
+    if lighting and scene.street is not None and len(circles):
+        # Their light falls on the ground below them, so that the reach says little.
+        heights = scene.street.lamps[:, 2].astype(np.float64)
+        circles[:, :2], circles[:, 2] = scene.street.lamps[:, :2], max(street_lighting.SPREAD) * (heights + 1.0)
+    return rows, circles
+
+
+def _street_lamps(scene: RenderScene, lighting: str) -> list[SceneLamp]:
+    """Return the lamps of the street under a class of lighting; none where it is unlit."""
+    if lighting == street_lighting.UNLIT or scene.street is None:
+        return []
     power, spread, colour, reach = STREET_LAMP
+    soft = 0.5
+    if lighting:
+        power = street_lighting.luminaire_power(scene.street, lighting, NIGHT_LUX) / float(colour @ TO_LUMINANCE)
+        spread, soft, reach = street_lighting.SPREAD, street_lighting.SOFT, street_lighting.REACH
     street_lamps = []
-    for x, y, z, heading in [] if scene.street is None else scene.street.lamps.astype(np.float64).tolist():
+    for x, y, z, heading in scene.street.lamps.astype(np.float64).tolist():
         pose = upright_pose(x, y, heading, z - 0.05) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        street_lamps.append(SceneLamp(pose, power, spread, colour, 0.5, False, reach, False))
+        street_lamps.append(SceneLamp(pose, power, spread, colour, soft, False, reach, False))
     return street_lamps
 
 
-def _beams(scene: RenderScene, mesh: int) -> list[SceneLamp]:
+def _beams(scene: RenderScene, mesh: int, *, low_beams: bool) -> list[SceneLamp]:
     """Return the head and tail lamps of a body, in its own frame."""
     body_lamps = []
     for name, (position, area) in scene.lights(mesh).items():
@@ -231,7 +347,10 @@ def _beams(scene: RenderScene, mesh: int) -> list[SceneLamp]:
             pose = upright_pose(
                 float(position[0]), float(position[1]), 0.0 if is_head_lamp else np.pi, float(position[2])
             )
-            body_lamps.append(_beam(pose, HEAD_LAMPS if is_head_lamp else TAIL_LAMPS, 1.0))
+            if is_head_lamp and low_beams:
+                body_lamps.append(low_beam(pose, 1.0, BEAM_REACH))
+            else:
+                body_lamps.append(_beam(pose, HEAD_LAMPS if is_head_lamp else TAIL_LAMPS, 1.0))
     return body_lamps
 
 
@@ -303,6 +422,9 @@ def _lamp_row(lamp: SceneLamp, layer: int) -> tuple[Any, ...]:
     across, down = lamp.spread
     rotation, position = lamp.pose[:3, :3], lamp.pose[:3, 3]
     light = np.asarray(lamp.colour) * lamp.power / lamp.area()
+    is_low_beam = lamp.pattern == "low_beam"
+    if is_low_beam:
+        across, down = 1.0, 1.0
     inner_squared = (1.0 - lamp.soft) ** 2 - 1e-6  # the width of the fade is never 0
     return (
         tuple(position),
@@ -311,7 +433,7 @@ def _lamp_row(lamp: SceneLamp, layer: int) -> tuple[Any, ...]:
         tuple(rotation[:, 2]),
         tuple(light),
         inner_squared,
-        int(lamp.is_square),
+        int(kernels.LOW_BEAM if is_low_beam else kernels.RECTANGLE if lamp.is_square else kernels.ELLIPSE),
         lamp.reach,
         layer,
         lamp.texture,
@@ -336,11 +458,12 @@ def lit_circle(lamp: SceneLamp) -> tuple[F64, float]:
 
 
 def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> SceneLamp:
-    """A lamp of a vehicle, at the origin of a frame that looks along x."""
+    """A lamp of a vehicle with even light, at the origin of a frame that looks along x."""
     power, spread, colour, reach, tilt = kind
     lamp_pose = pose @ AHEAD
     lamp_pose[:3, :3] = lamp_pose[:3, :3] @ _downward_rotation(tilt)
-    return SceneLamp(lamp_pose, power * strength, spread, colour, 0.6, False, reach, False)
+    pattern: Pattern = "head_lamp" if kind is HEAD_LAMPS else "even"
+    return SceneLamp(lamp_pose, power * strength, spread, colour, 0.6, False, reach, False, pattern=pattern)
 
 
 def lamp_lens(lamp: SceneLamp) -> tuple[float, float, float, float]:

@@ -11,9 +11,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from ssad.rendering.camera.lamps import NIGHT_LUX
 from ssad.rendering.camera.render import SceneWeather, scene_light
 
-NIGHT_LUX = 1.0 / 60.0  # irradiance over pi of one lux at night; basis of the lamps of street and vehicles
 # lowest altitude of the sun in degrees -> coefficients of the logarithm of its illuminance
 _CLEAR = (
     (20.0, (3.74, 3.97, -4.07, 1.47)),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -13,21 +14,29 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
+from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
+from ssad.rendering.camera.kernels import finish as finish_kernels
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
-from ssad.rendering.camera.kernels import raster, shade, sky
+from ssad.rendering.camera.kernels import puddle, shade, sky
 from ssad.rendering.camera.kernels import sensor as sensing
 from ssad.rendering.camera.lamps import (
     LAMP_NEAR,
     LAMP_SHADOWS,
+    NIGHT_LUX,
+    TO_LUMINANCE,
     SceneLamp,
     lamp_lens,
     lamp_strength,
     nearby_lights,
     struct_array,
+    with_low_beams,
 )
+from ssad.rendering.camera.probes import gather_probes, no_probes
 from ssad.rendering.camera.scene import (
     DrawCalls,
+    Finish,
     ObjectTable,
     RenderScene,
     SceneObject,
@@ -44,12 +53,13 @@ from ssad.rendering.camera.sensor import (
     noise_levels,
     point_spread,
 )
+from ssad.rendering.camera.street_lighting import UNLIT, UNLIT_LUX, USUAL_CLASS, check_lighting
+from ssad.rendering.camera.visibility import VisibilityPass, sun_map
 
-NEAR = 0.15  # m
 FAR = 500.0
-LARGE, ROW_LANES = 4096, 32  # large triangles that a view may list, threads for each
-FACE_LANES = 512  # threads for each draw on a GPU
 SHADOW_SIZE, SHADOW_REACH = 768, 60.0  # texels, m from the middle to the border
+SOFT_WIDE, SOFT_FINE = (1.5, 2), (1.0, 4)  # texels: smallest filter of soft shadows, and search for occluders
+VISUAL_RANGE = 12_000.0  # m: distance at which haze leaves 2 % of the contrast, as on a clear summer day
 FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
 
@@ -65,6 +75,11 @@ class SceneWeather:
         wet: Wetness of the ground, 0 to 1.
         exposure: Stops relative to the exposure that suits the light.
         turn: Offset of the clouds.
+        lighting: Class of the street lighting at night (see `ssad.rendering.camera.street_lighting`); "": with the
+            effect `street-lighting` the usual class, without it lamps that meet none.
+
+    Raises:
+        UnknownNameError: There is no such class.
     """
 
     sun_height: float = 0.7
@@ -74,6 +89,10 @@ class SceneWeather:
     wet: float = 0.0
     exposure: float = 0.0
     turn: float = 0.0
+    lighting: str = ""
+
+    def __post_init__(self) -> None:
+        check_lighting(self.lighting)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +131,20 @@ class RenderQuality:
         fine: A fine shadow map around the focus.
         contact: Bodies occlude the light of the sky on the ground.
         lamps: Lamps of the street and of objects, and their shadows.
+        effects: Names of further effects that are on, see `ssad.rendering.camera.effects`.
     """
 
     shadows: bool = True
     fine: bool = True
     contact: bool = True
     lamps: bool = True
+    effects: frozenset[str] = DEFAULT_EFFECTS
+
+    def __post_init__(self) -> None:
+        check_effects(self.effects)
 
 
-PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False)
+PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False, effects=NO_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +181,7 @@ class Rendering:
         surface: Surfaces that the pixels show; None unless requested.
         material: Row of each pixel's material in `RenderScene.material_names` [B, H, W]; -1: sky. None unless
             requested.
+        effects: Effects that were on.
     """
 
     image: U8
@@ -167,6 +192,7 @@ class Rendering:
     fragments: Any
     surface: SurfaceMap | None = None
     material: I32 | None = None
+    effects: frozenset[str] = NO_EFFECTS
 
 
 @lru_cache(maxsize=256)
@@ -190,11 +216,16 @@ def scene_light(weather: SceneWeather) -> tuple[tuple[Any, ...], float]:
     sun_colour = np.array([1.0, 0.72 + 0.25 * warmth, 0.42 + 0.48 * warmth]) * 2.6 * sun_share
     cloud_colour = np.array([0.88, 0.92, 0.98])
     cloud_share = weather.clouds**2
-    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - cloud_share) + cloud_colour * cloud_share) * (0.010 + 0.9 * daylight)
+    zenith_colour = np.array([0.24, 0.46, 0.98]) * (1 - cloud_share) + cloud_colour * cloud_share
+    horizon_colour = np.array([0.95, 1.12, 1.30]) * (1 - cloud_share) + 1.15 * cloud_colour * cloud_share
+    night_zenith, night_horizon = 0.010, 0.016
+    if weather.lighting == UNLIT:
+        # The same weights of zenith and horizon as in the shading of level ground.
+        level = (0.65 * night_zenith * zenith_colour + 0.35 * night_horizon * horizon_colour) @ TO_LUMINANCE
+        night_zenith, night_horizon = (night * UNLIT_LUX * NIGHT_LUX / level for night in (night_zenith, night_horizon))
+    zenith = zenith_colour * (night_zenith + 0.9 * daylight)
     horizon_glow = np.array([1.0, 0.55, 0.30]) * (1 - warmth) * 0.5 * daylight
-    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - cloud_share) + 1.15 * cloud_colour * cloud_share) * (
-        0.016 + 0.9 * daylight
-    )
+    horizon = horizon_colour * (night_horizon + 0.9 * daylight)
     horizon = horizon + horizon_glow * (1 - weather.clouds)
     # Light that the ground reflects upwards.
     ground = 0.16 * (horizon + 0.5 * sun_colour * max(sun[2], 0))
@@ -232,75 +263,21 @@ def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2] - 0.5), float(matrix[1, 2] - 0.5)
 
 
-@lru_cache(maxsize=1)
-def response() -> U8:
-    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
+@lru_cache(maxsize=256)
+def response(gamma: float = 1.0, contrast: float = 0.0) -> U8:
+    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB.
+
+    Args:
+        gamma: See `ssad.rendering.camera.sensor.SensorModel`.
+        contrast: See there.
+    """
     light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
     compressed = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
     encoded = np.where(compressed <= 0.0031308, compressed * 12.92, 1.055 * compressed ** (1 / 2.4) - 0.055)
+    if (gamma, contrast) != (1.0, 0.0):
+        encoded = np.clip(encoded, 0.0, 1.0) ** gamma
+        encoded = encoded + contrast * encoded * (1 - encoded) * (2 * encoded - 1)
     return np.asarray(np.rint(encoded * 255), np.uint8)
-
-
-class _VisibilityPass:
-    """Visibility pass over all views: draws, slots and samples."""
-
-    def __init__(
-        self,
-        scene: RenderScene,
-        draws: DrawCalls,
-        lens: F32,
-        *,
-        ortho: bool,
-        size: tuple[int, int],
-        scale: int,
-        near: float = NEAR,
-    ) -> None:
-        device = scene.device
-        face_count = int(draws.counts.sum())
-        draw_table = shade.DrawRanges()
-        starts = wp.array(np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device)
-        firsts = wp.array(draws.firsts, dtype=int, device=device)
-        draw_table.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
-        draw_table.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
-        draw_table.tags = wp.array(draws.tags, dtype=int, device=device)
-        draw_table.lit = wp.array(draws.lit, dtype=int, device=device)
-        self.lens = wp.array(lens, dtype=wp.vec4, device=device)
-        views = wp.array(draws.views, dtype=int, device=device)
-        height, width = size[0] * scale, size[1] * scale
-        self.samples = draw_table.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
-        self.draw_ranges = draw_table
-        draw_table.owners = wp.empty(max(face_count, 1), dtype=wp.vec2i, device=device)
-        if not face_count:
-            return
-        on_gpu = device != "cpu"
-        # On a GPU, threads share the faces of a draw, and the rows of large triangles.
-        large_capacity = LARGE * len(lens) if on_gpu else 1
-        # If the list is full, the kernel fills large triangles itself: only speed is lost.
-        large_triangles = wp.empty(large_capacity, dtype=raster.Triangle, device=device)
-        large_count = wp.zeros(1, dtype=int, device=device)
-        lanes = FACE_LANES if on_gpu else 1
-        inputs = [
-            scene.vertices,
-            scene.faces,
-            scene.listed,
-            starts,
-            firsts,
-            views,
-            draw_table.matrices,
-            self.lens,
-            near,
-            float(scale),
-            int(ortho),
-            lanes,
-            256.0 if on_gpu else 1e30,
-        ]
-        outputs = [draw_table.owners, self.samples, large_triangles, large_count]
-        wp.launch(raster.fill, dim=(len(draws.counts), lanes), inputs=inputs, outputs=outputs, device=device)
-        if on_gpu:
-            inputs = [large_triangles, large_count, ROW_LANES]
-            wp.launch(
-                raster.fill_large, dim=(large_capacity, ROW_LANES), inputs=inputs, outputs=[self.samples], device=device
-            )
 
 
 def render(
@@ -332,9 +309,12 @@ def render(
     """
     if not views:
         raise ConfigError("no view to render")
+    views = [replace(view, sensor=with_lens_effects(view.sensor, quality.effects)) for view in views]
     size = (views[0].camera.height, views[0].camera.width)
     if any((entry.camera.height, entry.camera.width) != size for entry in views):
         raise ConfigError("views of one call must have one size")
+    # Koschmieder: contrast falls to 2 % over the visual range.
+    haze = 3.912 / VISUAL_RANGE if "haze" in quality.effects else 0.0
     lens, lights, exposures = [], [], []
     for view_index, view in enumerate(views):
         intrinsic = view.camera.intrinsic
@@ -346,10 +326,13 @@ def render(
             raise ConfigError(f"view {view_index}: a camera needs a finite pose and a positive focal length")
         lens.append(kernel_lens(intrinsic))
         view_light, exposure = scene_light(view.weather)
-        lights.append(view_light)
+        lights.append((*view_light, haze))
         exposures.append(exposure)
+    views = [_with_effects(entry, quality.effects) for entry in views]
     poses = np.array([entry.pose for entry in views], np.float64)
     bodies = collect_objects([entry.objects for entry in views])
+    if "vehicle-signals" not in quality.effects:
+        bodies = replace(bodies, signals=np.zeros_like(bodies.signals))
     # Beyond six extinction lengths fog hides everything.
     far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
     draws = scene.gather_draw_calls(
@@ -359,10 +342,15 @@ def render(
         axes=poses[:, :3, 2],
         reach=(70.0, 180.0),
         far=far_limits,
+        street_lit=np.array([entry.weather.lighting != UNLIT for entry in views]),
     )
-    visible = _VisibilityPass(scene, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
+    visible = VisibilityPass(scene, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
     shadows = _sun_shadows(scene, views, bodies, [view_light[0] for view_light in lights], quality)
     nearby_light = _near(scene, views, bodies, quality)
+    if "reflections" in quality.effects:
+        probes = gather_probes(scene, views, lights, shadows=quality.shadows, lamps=quality.lamps)
+    else:
+        probes = no_probes(scene)
     device, shape = scene.device, (len(views), *size)
     layer_tables = _layers(draws, views, scene.device)
     projecting = any(lamp.texture >= 0 for entry in views for lamp in entry.lamps)
@@ -374,26 +362,36 @@ def render(
     fragment_capacity = output.radiance.size * 2 if layer_tables.any or projecting else 1
     output.fragments = wp.empty(fragment_capacity, dtype=layer_kernels.Fragment, device=device)
     output.found = wp.zeros(1, dtype=int, device=device)
-    output.surface = int(surface)
+    finishes = _finishes(scene, views)
+    exports_surface = surface or finishes is not None
+    output.surface = int(exports_surface)
     for name in SURFACE:
-        setattr(output, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+        setattr(output, name, wp.zeros(shape if exports_surface else (1, 1, 1), dtype=wp.vec3, device=device))
+    is_wet = "wet-reflections" in quality.effects and any(view.weather.wet > 0.0 for view in views)
+    output.wet = int(is_wet)
+    for name, dtype in (("mirror", wp.vec4), ("spread", wp.float32), ("source", wp.vec3)):
+        setattr(output, name, wp.empty(shape if is_wet else (1, 1, 1), dtype=dtype, device=device))
     # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
+    to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
     inputs = [
         scene.geometry,
         visible.draw_ranges,
         layer_tables,
         visible.lens,
-        wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
+        to_world,
         wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device),
         shadows,
         nearby_light,
+        probes,
         int(projecting),
         scale,
         lanes,
         output,
     ]
     wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
+    if is_wet:
+        _add_wet_reflections(output, visible.lens, to_world, lanes)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layer_tables.any or projecting:
         count = int(output.found.numpy()[0])
@@ -404,18 +402,48 @@ def render(
         fragments = output.fragments[:count].numpy() if count else fragments
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
+    material = None
+    if materials or finishes is not None:
+        found_materials = wp.empty(shape, dtype=int, device=device)
+        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
+        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
+        material = found_materials.numpy() if materials else None
+    if finishes is not None:
+        to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
+        surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
+        inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
+        wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
+    add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
     if download:
         arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
     exported = _surface(output, np.array(lens), poses) if surface else None
-    material = None
-    if materials:
-        found_materials = wp.empty(shape, dtype=int, device=device)
-        inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
-        wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
-        material = found_materials.numpy()
-    return Rendering(*arrays, np.array(exposures), fragments, exported, material)
+    return Rendering(*arrays, np.array(exposures), fragments, exported, material, quality.effects)
+
+
+def _add_wet_reflections(output: Any, lens: Any, to_world: Any, lanes: int) -> None:
+    """Add what water on the ground mirrors of the picture itself."""
+    device, (count, height, width) = output.depth.device, output.depth.shape
+    rows = (height + int(puddle.ROWS) - 1) // int(puddle.ROWS)
+    keys = wp.zeros((count, rows, width), dtype=wp.uint64, device=device)
+    inputs = [output.depth, lens, to_world, lanes]
+    wp.launch(puddle.mirror_pixels, dim=(count, rows, lanes), inputs=inputs, outputs=[keys], device=device)
+    sums = wp.zeros((count, rows + 1, width), dtype=wp.vec4, device=device)
+    counts = wp.zeros((count, rows + 1, width), dtype=float, device=device)
+    inputs = [keys, output.source, lanes]
+    wp.launch(puddle.sum_columns, dim=(count, lanes), inputs=inputs, outputs=[sums, counts], device=device)
+    inputs = [output.depth, lens, sums, counts, output.mirror, output.spread, lanes, output.radiance]
+    wp.launch(puddle.add_mirror_image, dim=(count, height, lanes), inputs=inputs, device=device)
+def _with_effects(view: View, effects: frozenset[str]) -> View:
+    """Return the view without the objects of effects that are off, and with the lamps of those that are on."""
+    if "street-lighting" in effects and not view.weather.lighting:
+        view = replace(view, weather=replace(view.weather, lighting=USUAL_CLASS))
+    if "low-beams" in effects and view.lamps:
+        view = replace(view, lamps=with_low_beams(view.lamps))
+    if all(not entry.effect or entry.effect in effects for entry in view.objects):
+        return view
+    return replace(view, objects=tuple(entry for entry in view.objects if not entry.effect or entry.effect in effects))
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")
@@ -440,6 +468,45 @@ def _surface(out: Any, lens: F64, poses: F64) -> SurfaceMap:
     return SurfaceMap(position=(position * is_solid[..., None]).astype(np.float32), **exported)
 
 
+def _finishes(scene: RenderScene, views: Sequence[View]) -> tuple[Any, Any] | None:
+    """Return the finishes of objects, and the row of each tag in each view; None if all are clean."""
+    rows: Any = []
+    places = []
+    for view_index, view in enumerate(views):
+        for scene_object in view.objects:
+            finish = scene_object.finish
+            if finish is None or finish == Finish() or scene_object.layers or scene_object.tag <= 0:
+                continue
+            from_world = np.linalg.inv(scene_object.pose)
+            lower, upper = scene.extent(scene_object.mesh)
+            places.append((view_index, scene_object.tag, len(rows)))
+            rows.append(
+                (
+                    from_world @ view.pose,
+                    tuple((from_world @ view.pose)[:3, 3]),
+                    max(float(upper[2] - lower[2]), 0.1),
+                    finish.metallic,
+                    finish.dirt,
+                    finish.wear,
+                    finish.seed % 4096,
+                    scene_object.tag,
+                )
+            )
+    if not rows:
+        return None
+    # Tags can be large numbers: their remainders, none of which two tags share, make a small table.
+    tags = {tag for _, tag, _ in places}
+    size = next(size for size in count(len(tags)) if len({tag % size for tag in tags}) == len(tags))
+    table = np.full((len(views), size), -1, np.int32)
+    for view_index, tag, row in places:
+        table[view_index, tag % size] = row
+    finish_rows: Any = np.array(rows, finish_kernels.Finish.numpy_dtype())  # type: ignore[attr-defined]
+    return (
+        wp.array(finish_rows, dtype=finish_kernels.Finish, device=scene.device),
+        wp.array(table, dtype=int, device=scene.device),
+    )
+
+
 def _sun_shadows(
     scene: RenderScene,
     views: Sequence[View],
@@ -457,47 +524,15 @@ def _sun_shadows(
         if view.focus is not None:
             fine_middles[view_index, :2] = view.focus
     is_up = any(sun[2] > 0.02 for sun in suns)
+    is_soft = "soft-shadows" in quality.effects
+    wide_size = SHADOW_SIZE if quality.shadows and is_up else 0
+    fine_size = FINE_SIZE if quality.shadows and quality.fine and is_up else 0
+    wide_filter, fine_filter = (SOFT_WIDE, SOFT_FINE) if is_soft else ((0.0, 0), (0.0, 0))
     shadows = shade.SunShadows()
-    shadows.wide, shadows.to_wide, shadows.wide_texel = _sun_map(
-        scene, bodies, suns, wide_middles, SHADOW_REACH, SHADOW_SIZE if quality.shadows and is_up else 0
-    )
-    shadows.fine, shadows.to_fine, shadows.fine_texel = _sun_map(
-        scene, bodies, suns, fine_middles, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and is_up else 0
-    )
+    shadows.soft = int(is_soft)
+    shadows.wide = sun_map(scene, bodies, suns, wide_middles, SHADOW_REACH, wide_size, soft=wide_filter)
+    shadows.fine = sun_map(scene, bodies, suns, fine_middles, FINE_REACH, fine_size, soft=fine_filter)
     return shadows
-
-
-def _sun_map(  # noqa: PLR0917
-    scene: RenderScene, bodies: ObjectTable, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
-) -> tuple[Any, Any, float]:
-    """Render a shadow map [B, size, size] around each middle.
-
-    Returns:
-        The maps, the matrices from the world to their texels, and the size of a texel, m.
-    """
-    middles = middles * [1.0, 1.0, 0.0]
-    texel = 2 * reach / max(size, 1)
-    to_light = _light_cameras(np.array(suns), middles)
-    to_texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
-    to_texels[:2, 3] = size / 2
-    matrices = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=scene.device)
-    if not size:
-        return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=scene.device), matrices, texel
-    image_centre = size / 2 - 0.5
-    intrinsics = np.tile(np.array([1 / texel, 1 / texel, image_centre, image_centre], np.float32), (len(middles), 1))
-    # Far enough for everything that can cast a shadow into the map; small street objects only near its middle.
-    far_limit = 1.4 * reach + 11.0
-    draws = scene.gather_draw_calls(
-        to_light,
-        bodies,
-        eyes=middles,
-        axes=None,
-        reach=(0.4 * reach, far_limit),
-        far=np.full(len(middles), far_limit),
-        horizon=False,
-        casts_shadows=True,
-    )
-    return _VisibilityPass(scene, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
 
 def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
@@ -550,7 +585,14 @@ def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
 
 def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, quality: RenderQuality) -> Any:
     """Build lamps with their shadow maps, and the bodies that occlude the sky from the ground."""
-    near_light = nearby_lights(scene, views, bodies, lamps=quality.lamps, contact=quality.contact)
+    near_light = nearby_lights(
+        scene,
+        views,
+        bodies,
+        lamps=quality.lamps,
+        contact=quality.contact,
+        low_beams="low-beams" in quality.effects,
+    )
     shadow_lamps = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not shadow_lamps:
         near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=scene.device)
@@ -569,7 +611,7 @@ def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, qualit
     )
     lens = np.array([lamp_lens(lamp) for _, lamp in shadow_lamps], np.float32)
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
-    near_light.shadows = _VisibilityPass(scene, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
+    near_light.shadows = VisibilityPass(scene, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
     return near_light
 
 
@@ -586,44 +628,39 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
     """
     device, (count, height, width) = radiance.device, radiance.shape
     rows: Any = []
+    for view in views:
+        view.sensor.check_size(height, width)
+    radiance = scatter(radiance, [view.sensor for view in views])
+    tones = list(dict.fromkeys(view.sensor.tone for view in views))
     for view, exposure in zip(views, exposures, strict=True):
         sensor = view.sensor
-        sensor.check_size(height, width)
         photons, dark_noise = noise_levels(sensor.noise, exposure)
         centre_weight, side_weight = point_spread(sensor.blur)
         rows.append(
-            (exposure, centre_weight, side_weight, sensor.full, photons, dark_noise, view.seed, int(sensor.mosaic))
+            (
+                tuple(exposure * factor for factor in sensor.balance),
+                centre_weight,
+                side_weight,
+                sensor.full,
+                photons,
+                dark_noise,
+                view.seed,
+                int(sensor.mosaic),
+                tones.index(sensor.tone),
+                sensor.saturation,
+            )
         )
     response_rows: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
     responses = wp.array(response_rows, dtype=sensing.Response, device=device)
-    curve = wp.array(response(), dtype=wp.uint8, device=device)
+    curves = wp.array(np.stack([response(*tone) for tone in tones]), dtype=wp.uint8, device=device)
     image = wp.empty((count, height, width, 3), dtype=wp.uint8, device=device)
     if any(view.sensor.mosaic for view in views):
         mosaic = wp.empty(radiance.shape, dtype=float, device=device)
         # A thread develops a 2 x 2 square of the mosaic.
         launch_shape = (count, (height + 1) // 2, (width + 1) // 2)
         wp.launch(sensing.expose, dim=launch_shape, inputs=[radiance, responses], outputs=[mosaic], device=device)
-        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curve], outputs=[image], device=device)
+        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curves], outputs=[image], device=device)
     if not all(view.sensor.mosaic for view in views):
-        inputs = [radiance, responses, curve]
+        inputs = [radiance, responses, curves]
         wp.launch(sensing.develop_plain, dim=radiance.shape, inputs=inputs, outputs=[image], device=device)
     return image
-
-
-def _light_cameras(suns: F64, middles: F64) -> F64:
-    """Return the matrices world to light [B, 4, 4], for directions to the sun and middles [B, 3].
-
-    z runs with the light, x and y across it; the origin is the middle, rounded to half a metre.
-    """
-    z_axes = -suns / np.linalg.norm(suns, axis=1, keepdims=True)
-    level_length = np.hypot(z_axes[:, 0], z_axes[:, 1])
-    safe_length = np.maximum(level_length, 1e-6)
-    x_axes = np.stack([-z_axes[:, 1] / safe_length, z_axes[:, 0] / safe_length, np.zeros(len(z_axes))], 1)
-    # A sun straight overhead has no azimuth.
-    x_axes[level_length <= 1e-6] = 1.0, 0.0, 0.0
-    rotations = np.stack([x_axes, np.cross(z_axes, x_axes), z_axes], 1)
-    matrices = np.zeros((len(z_axes), 4, 4))
-    matrices[:, :3, :3] = rotations
-    matrices[:, :3, 3] = -np.round((rotations @ middles[..., None])[..., 0] * 2) / 2
-    matrices[:, 3, 3] = 1.0
-    return matrices

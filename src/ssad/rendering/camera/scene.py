@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from enum import IntFlag
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, F64, I32, Bool
+from ssad.rendering.camera.kernels import light as light_kernels
 from ssad.rendering.camera.kernels import matter
 from ssad.rendering.camera.kernels import shade as kernels
 from ssad.rendering.meshes.mesh import Material, Mesh
@@ -115,6 +117,33 @@ def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class Finish:
+    """Finish of a body beyond the colour of its paint.
+
+    Attributes:
+        metallic: Strength of the effect pigments in its paint, 0 to 1: surfaces that face the camera are lighter,
+            those that turn away darker, as flakes that lie flat in the paint make them.
+        dirt: Amount of dirt and dust, 0 to 1.
+        wear: Chalking, scratches and rust of its paint, 0 to 1.
+        seed: Of its pattern.
+
+    Raises:
+        ConfigError: A value is outside its range.
+    """
+
+    metallic: float = 0.0
+    dirt: float = 0.0
+    wear: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= amount <= 1.0 for amount in (self.metallic, self.dirt, self.wear)):
+            raise ConfigError(
+                f"a finish of {self.metallic} (metallic), {self.dirt} (dirt), {self.wear} (wear): give 0 to 1"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class SceneObject:
     """Body in a view.
 
@@ -127,6 +156,9 @@ class SceneObject:
             wear any.
         is_lit: Whether its lamps are on; at night they light the scene.
         is_hidden: Whether it is invisible; it still casts its shadow.
+        signals: `LampSignal` bits of its stop lamps and indicators that shine.
+        effect: Name of the effect of the rendering without which it is not drawn; "": always.
+        finish: Metallic paint, dirt and wear; None for a clean body. What wears textures stays clean.
     """
 
     mesh: int
@@ -136,11 +168,25 @@ class SceneObject:
     layers: tuple[TextureLayer, ...] = ()
     is_lit: bool = True
     is_hidden: bool = False
+    signals: int = 0
+    effect: str = ""
+    finish: Finish | None = None
+
+
+class LampSignal(IntFlag):
+    """Stop lamps and indicators of a vehicle."""
+
+    BRAKE = int(light_kernels.BRAKING)
+    LEFT = int(light_kernels.TURNING_LEFT)
+    RIGHT = int(light_kernels.TURNING_RIGHT)
 
 
 @dataclass(frozen=True, slots=True)
 class DrawCalls:
-    """N ranges of listed faces, each under one matrix (object to camera) in one view."""
+    """N ranges of listed faces, each under one matrix (object to camera) in one view.
+
+    `lit` are bits of the kernels: lamps on, and `LampSignal`. `splits` [N, 2] are as of `RenderScene.lamp_split`.
+    """
 
     firsts: I32
     counts: I32
@@ -149,6 +195,7 @@ class DrawCalls:
     paints: F32
     tags: I32
     lit: I32
+    splits: F32
     layers: tuple[tuple[TextureLayer, ...], ...]
 
 
@@ -165,6 +212,7 @@ class ObjectTable:
         tag: [N].
         lit: Whether its lamps are on [N].
         hidden: Whether it only casts a shadow [N].
+        signals: `LampSignal` bits [N].
     """
 
     objects: tuple[SceneObject, ...]
@@ -175,6 +223,7 @@ class ObjectTable:
     tag: I32
     lit: Bool
     hidden: Bool
+    signals: I32
 
 
 def collect_objects(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
@@ -195,10 +244,20 @@ def collect_objects(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectT
         np.array([entry.tag for entry in flat_objects], np.int32),
         np.array([entry.is_lit for entry in flat_objects], bool),
         np.array([entry.is_hidden for entry in flat_objects], bool),
+        np.array([entry.signals for entry in flat_objects], np.int32),
     )
 
 
 LAMPS = ("head_lamp", "tail_lamp")
+LAMP_KINDS = {  # kind of lamp of a material by its name
+    "head_lamp": int(light_kernels.HEAD_LAMP),
+    "tail_lamp": int(light_kernels.TAIL_LAMP),
+    "indicator": int(light_kernels.INDICATOR),
+    "brake_lamp": int(light_kernels.BRAKE_LAMP),
+    "lamp_light": int(light_kernels.STREET_LAMP),
+}
+INDICATOR_SHARE = 0.35  # outer share of the width of a head or tail lamp that is its indicator
+CLUSTER_SIDE = 0.35  # m from the axis that a lamp with an indicator reaches: those of motorcycles do not
 NIGHT = {  # added to the emission of a material at night, while lamps are on
     "head_lamp": 2.0,
     "tail_lamp": 0.8,
@@ -302,6 +361,17 @@ class RenderScene:
             lights_by_kind[name] = (weight @ middles / max(total, 1e-12), total)
         return lights_by_kind
 
+    def lamp_split(self, mesh: int) -> tuple[float, float]:
+        """Return the distances from the axis of a mesh beyond which its head lamps and tail lamps are indicators, m.
+
+        They are infinite where the mesh has indicators of its own, or lamps that are not at its sides.
+        """
+        return self.compute_once(("lamp split", mesh), lambda: _lamp_split(self.meshes[mesh]))  # type: ignore[no-any-return]
+
+    def extent(self, mesh: int) -> tuple[F64, F64]:
+        """Return the smallest and the largest corner of a mesh in its own frame, m, [3] each."""
+        return self.compute_once(("extent", mesh), self.meshes[mesh].bounds)  # type: ignore[no-any-return]
+
     def ground_cover(self, mesh: int) -> tuple[F64, F64, float, float]:
         """Return the ground that a mesh covers.
 
@@ -372,6 +442,7 @@ class RenderScene:
         far: F64,
         horizon: bool = True,
         casts_shadows: bool = False,
+        street_lit: Bool | None = None,
     ) -> DrawCalls:
         """Return what B views draw: tiles of the street, and objects neither wholly behind them nor too far away.
 
@@ -384,6 +455,7 @@ class RenderScene:
             far: Distance beyond which nothing is drawn [B], m.
             horizon: See `tiles`.
             casts_shadows: Whether hidden things are needed too.
+            street_lit: Whether the lamps of the street are on in each view [B]; None: in all.
         """
         firsts, counts, views = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
         tile_count = len(firsts)
@@ -413,19 +485,24 @@ class RenderScene:
             np.zeros(draw_count, np.int32),
             np.ones(draw_count, np.int32),
         )
+        splits = np.full((draw_count, 2), np.inf, np.float32)
+        if street_lit is not None:
+            lit[:tile_count] = street_lit[views[:tile_count]]
         paints[tile_count:], tags[tile_count:], lit[tile_count:] = (
             bodies.paint[visible],
             bodies.tag[visible],
-            bodies.lit[visible],
+            bodies.lit[visible] | bodies.signals[visible],
         )
+        for draw in np.flatnonzero(bodies.signals[visible]).tolist():
+            splits[tile_count + draw] = self.lamp_split(int(bodies.mesh[visible[draw]]))
         layers = ((),) * tile_count + tuple(bodies.objects[object_index].layers for object_index in visible.tolist())
-        return DrawCalls(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, layers)
+        return DrawCalls(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, splits, layers)
 
 
 def surface(material: Material) -> tuple[Any, ...]:
     """Return the row of a material for the kernels."""
     pattern = PATTERNS.get(material.name, matter.PLAIN)
-    night, lamp = NIGHT.get(material.name, 0.0), int(material.name in LAMPS)
+    night, lamp = NIGHT.get(material.name, 0.0), LAMP_KINDS.get(material.name, 0)
     return (
         material.colour,
         material.specular,
@@ -436,6 +513,25 @@ def surface(material: Material) -> tuple[Any, ...]:
         lamp,
         int(pattern),
     )
+
+
+def _lamp_split(body: Mesh) -> tuple[float, float]:
+    """See `RenderScene.lamp_split`."""
+    corners = body.corners()
+    kinds = np.array([LAMP_KINDS.get(material.name, 0) for material in body.materials])[body.material]
+    indicators = corners[kinds == LAMP_KINDS["indicator"]].reshape(-1, 3)
+    splits = []
+    for name in LAMPS:
+        lamps = corners[kinds == LAMP_KINDS[name]].reshape(-1, 3)
+        sides = np.abs(lamps[:, 1])
+        if not len(lamps) or sides.max() < CLUSTER_SIDE:
+            splits.append(np.inf)
+            continue
+        # Indicators of its own are those at the same end of the body.
+        is_same_end = np.abs(indicators[:, 0] - lamps[:, 0].mean()) < 0.3 * np.ptp(corners[..., 0])
+        split = sides.max() - INDICATOR_SHARE * (sides.max() - sides.min())
+        splits.append(np.inf if is_same_end.any() else float(split))
+    return splits[0], splits[1]
 
 
 def _ground_cover(body: Mesh) -> tuple[F64, F64, float, float]:

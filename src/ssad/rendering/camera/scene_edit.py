@@ -11,6 +11,7 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
+from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import Rendering, View, develop_radiance, render, scene_light
@@ -164,7 +165,8 @@ def render_with(
         )
         radiance = retexture(taps, texture, radiance)
     developed_radiance = radiance.numpy()
+    lenses = [replace(view, sensor=with_lens_effects(view.sensor, rendering.effects)) for view in views]
     image = develop_radiance(
-        wp.array(developed_radiance, dtype=wp.vec3, device=scene.device), views, rendering.exposure.tolist()
+        wp.array(developed_radiance, dtype=wp.vec3, device=scene.device), lenses, rendering.exposure.tolist()
     )
     return replace(rendering, image=image.numpy(), radiance=developed_radiance)

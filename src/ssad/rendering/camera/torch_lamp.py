@@ -40,12 +40,14 @@ def lamp_light(
         rectangle.
 
     Raises:
-        ConfigError: The lamp projects a texture (see `ssad.rendering.camera.texture`).
+        ConfigError: The lamp is a low beam, or projects a texture (see `ssad.rendering.camera.texture`).
     """
     if lamp.texture >= 0:
         raise ConfigError(
             "a lamp that projects a texture is a linear function of it: use ssad.rendering.camera.texture"
         )
+    if lamp.pattern == "low_beam":
+        raise ConfigError("a low beam has no light in torch: use a lamp with even light")
     pose = position.new_tensor(lamp.pose) if pose is None else pose.to(position)
     power = position.new_tensor(lamp.power) if power is None else power.to(position)
     spread = position.new_tensor(lamp.spread) if spread is None else spread.to(position)

@@ -15,9 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, pad, pixel_shuffle
+from torch.nn.functional import conv2d, grid_sample, interpolate, pad, pixel_shuffle
 
 from ssad.core.errors import ConfigError
+from ssad.rendering.camera.glare import (
+    GHOST_LEVEL,
+    direct_share,
+    ghost_lights,
+    ghost_source_level,
+    glare_weights,
+    level_count,
+    pyramid_weights,
+)
 from ssad.rendering.camera.sensor import (
     ACROSS,
     ALONG,
@@ -26,6 +35,7 @@ from ssad.rendering.camera.sensor import (
     DEFAULT_SENSOR,
     GREEN,
     KNEE,
+    LUMINANCE,
     OPPOSITE,
     SHOULDER,
     SMALLEST,
@@ -94,8 +104,84 @@ def _to_squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
     return pixel_shuffle(conv2d(padded, weights, stride=2), 2)[:, :, :height, :width]
 
 
+@lru_cache(maxsize=32)
+def _halving_matrices(size: int, levels: int, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+    """Return the matrices [n, m] of an axis from each level of the pyramid to the next."""
+    matrices = []
+    for weights in pyramid_weights(size, levels):
+        half = len(weights)
+        taps = 2 * np.arange(half)[:, None] + np.arange(-1, 3)
+        matrix = np.zeros((half, size))
+        # Taps outside of the axis have no weight.
+        np.add.at(matrix, (np.arange(half)[:, None], np.clip(taps, 0, size - 1)), weights)
+        matrices.append(_constant_tensor(matrix, device, dtype))
+        size = half
+    return matrices
+
+
+def _enlarge(image: Tensor, height: int, width: int) -> Tensor:
+    """Return images [B, C, h, w] at twice the size, cropped to H x W."""
+    return interpolate(image, scale_factor=2, mode="bilinear", align_corners=False)[:, :, :height, :width]
+
+
+def scatter(light: Tensor, sensor: SensorModel) -> Tensor:
+    """Return the light behind the lens: what it scatters and its ghosts, see `ssad.rendering.camera.glare`.
+
+    Args:
+        light: Linear, [B, H, W, 3].
+        sensor: Sensor with glare, flare and focal length.
+
+    Returns:
+        The same shape; the light itself without glare and flare.
+
+    Raises:
+        ConfigError: The image is smaller than 4 x 4.
+    """
+    if not sensor.scatters:
+        return light
+    height, width = light.shape[1:3]
+    sensor.check_size(height, width)
+    levels, weights = level_count(height, width), glare_weights(sensor, height, width)
+    image = light.permute(0, 3, 1, 2)
+    pyramid = [image]
+    for rows, columns in zip(
+        _halving_matrices(height, levels, light.device, light.dtype),
+        _halving_matrices(width, levels, light.device, light.dtype),
+        strict=True,
+    ):
+        pyramid.append(rows @ pyramid[-1] @ columns.T)
+    ghost_level = min(GHOST_LEVEL, levels)
+    scattered = pyramid[-1] * float(weights[-1])
+    for level in range(levels, 0, -1):
+        if level < levels:
+            scattered = _enlarge(scattered, *pyramid[level].shape[2:]) + pyramid[level] * float(weights[level - 1])
+        if level == ghost_level and sensor.flare > 0:
+            scattered = scattered + _ghosts(pyramid, level, sensor)
+    behind = image * direct_share(sensor, weights) + _enlarge(scattered, height, width)
+    return behind.permute(0, 2, 3, 1)
+
+
+def _ghosts(pyramid: Sequence[Tensor], level: int, sensor: SensorModel) -> Tensor:
+    """Return the ghosts of an image at a level of its pyramid, [B, 3, h, w]."""
+    height, width = pyramid[0].shape[2:]
+    source_level = ghost_source_level(height, width)
+    source, (rows, columns) = pyramid[source_level], pyramid[level].shape[2:]
+    total = torch.zeros_like(pyramid[level])
+    for size, tint in ghost_lights(sensor):
+        coordinates = []
+        for count, extent, source_count in ((columns, width, source.shape[3]), (rows, height, source.shape[2])):
+            place = (torch.arange(count, dtype=source.dtype, device=source.device) + 0.5) * 2**level
+            place = ((place - 0.5 * extent) / size + 0.5 * extent) / 2**source_level
+            # From pixels to the -1 to 1 of `grid_sample`.
+            coordinates.append(2 * place / source_count - 1)
+        grid = torch.stack(torch.meshgrid(*coordinates, indexing="xy"), -1)[None].expand(len(source), -1, -1, -1)
+        ghost = grid_sample(source, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        total = total + ghost * source.new_tensor(tint)[:, None, None]
+    return total
+
+
 def photosites(light: Tensor, sensor: SensorModel) -> Tensor:
-    """Return the light on the photosites: the lens's point spread, and one colour for each with a mosaic.
+    """Return the light on the photosites: glare, the lens's point spread, and one colour for each with a mosaic.
 
     Args:
         light: Linear, [B, H, W, 3].
@@ -108,6 +194,7 @@ def photosites(light: Tensor, sensor: SensorModel) -> Tensor:
         ConfigError: The image is smaller than 4 x 4.
     """
     sensor.check_size(*light.shape[1:3])
+    light = scatter(light, sensor)
     colours = light.permute(0, 3, 1, 2)
     spread, square = _lens_weights(sensor.blur, light.device, light.dtype)
     if sensor.mosaic:
@@ -198,6 +285,28 @@ class _Curve(torch.autograd.Function):
         return gradient
 
 
+def render_colours(light: Tensor, sensor: SensorModel) -> Tensor:
+    """Apply the saturation, the curve, the gamma and the contrast of a sensor.
+
+    Args:
+        light: Linear, [..., 3].
+        sensor: The sensor.
+
+    Returns:
+        sRGB in [0, 1].
+    """
+    if sensor.saturation != 1.0:
+        grey = (light * light.new_tensor(LUMINANCE)).sum(-1, keepdim=True)
+        light = light * sensor.saturation + grey * (1.0 - sensor.saturation)
+    encoded = curve(light)
+    if sensor.gamma != 1.0:
+        # The slope of a power below 1 has no bound at black.
+        encoded = encoded.clamp_min(1e-6) ** sensor.gamma
+    if sensor.contrast != 0.0:
+        encoded = encoded + sensor.contrast * encoded * (1 - encoded) * (2 * encoded - 1)
+    return encoded
+
+
 def draw_noise(shape: Sequence[int], sensor: SensorModel, generator: torch.Generator) -> Tensor:
     """Draw a sample of noise for `develop`: standard normal numbers.
 
@@ -258,8 +367,11 @@ def develop(
         noise = draw_noise(radiance.shape[:3], sensor, noise)
     if noise is not None:
         noise = noise.to(radiance)
-    raw = fill(photosites(radiance * exposure_factor, sensor), exposure, sensor, noise)
-    return curve(demosaic(raw) if sensor.mosaic else raw).permute(0, 3, 1, 2)
+    light = radiance * exposure_factor
+    if sensor.balance != (1.0, 1.0, 1.0):
+        light = light * light.new_tensor(sensor.balance)
+    raw = fill(photosites(light, sensor), exposure, sensor, noise)
+    return render_colours(demosaic(raw) if sensor.mosaic else raw, sensor).permute(0, 3, 1, 2)
 
 
 # ---------------------------------------------------------------- windows of changed pixels

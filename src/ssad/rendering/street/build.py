@@ -23,7 +23,7 @@ from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
 from ssad.world.roads.library import load_town
 
-REVISION = 3  # of the construction: a cached street of another revision is not used
+REVISION = 4  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:

@@ -237,9 +237,10 @@ class TownMaterials:
         self.pole = add("lamp_post", self._jitter(post_colour, 0.1), gloss=0.4)
         self.black = add("black_plastic", (0.02, 0.02, 0.022), gloss=0.4)
         self.glow = add("lamp_light", (0.85, 0.80, 0.68), gloss=0.5)
-        self.red = add("signal_red", (0.30, 0.02, 0.015), gloss=0.6)
-        self.amber = add("signal_amber", (0.30, 0.14, 0.01), gloss=0.6)
-        self.green = add("signal_green", (0.01, 0.22, 0.10), gloss=0.6)
+        # The lens of a signal is dark while it is off, so that no light from outside makes it seem lit.
+        self.red = add("signal_red", (0.09, 0.007, 0.005), gloss=0.6)
+        self.amber = add("signal_amber", (0.09, 0.042, 0.004), gloss=0.6)
+        self.green = add("signal_green", (0.004, 0.066, 0.03), gloss=0.6)
         self.glass = [
             add("window", self._jitter(rgb, 0.3), specular=0.09, gloss=0.9)
             for rgb in ((0.035, 0.045, 0.055), (0.05, 0.055, 0.055), (0.02, 0.028, 0.036), (0.07, 0.085, 0.10))

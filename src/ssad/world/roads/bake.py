@@ -7,7 +7,7 @@ import gc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,8 +36,10 @@ WIDE = 100.0  # m; a wider lane is a mistake
 MAX_LANE_METRES = 5.0e6  # of all lanes: bounds the memory of the reader
 LANELET2 = ".osm"  # suffix of Lanelet2 maps
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
+UNCONTROLLED_SPEED = 50.0 / 3.6  # m/s, across junctions without lights and signs
 
 Progress = Callable[[str], None]
+Uncontrolled = Literal["keep", "slow", "signals"]
 
 
 @dataclass
@@ -123,6 +125,7 @@ def import_map(
     report: ImportReport | None = None,
     strict: bool = False,
     turn_on_red: bool | None = None,
+    uncontrolled: Uncontrolled = "keep",
     progress: Progress | None = None,
     lanelet2: Lanelet2Options | None = None,
 ) -> Path:
@@ -138,6 +141,8 @@ def import_map(
         report: Filled with what came in, what was left out, and what is doubtful.
         strict: Refuse a file with doubts.
         turn_on_red: Turns to the near side are allowed on red; None: as the file suggests.
+        uncontrolled: Junctions where ways meet and the file has neither lights nor signs: `keep` them; `slow` traffic
+            across them to 50 km/h; or do so and add traffic lights (`signals`).
         progress: Called with the name of each stage when it begins.
         lanelet2: Origin, projection and rule of the road of a Lanelet2 map.
 
@@ -164,6 +169,8 @@ def import_map(
         account.refuse_doubts(MapError)
     if turn_on_red is not None:
         graph = replace(graph, turn_on_red=np.array([turn_on_red]))
+    if uncontrolled != "keep":
+        graph = _control_junctions(graph, account, has_lights=uncontrolled == "signals")
     if progress:
         progress(f"writing town {town_name}")
     source = Path(path).with_suffix(".xodr")
@@ -309,6 +316,37 @@ def _assemble(
     roads = f"{len(network.roads)} roads, {len(network.junctions)} junctions"
     describe(graph, roads, report, lambda lane: _name(graph, lane))
     return graph
+
+
+def _control_junctions(graph: LaneGraph, report: ImportReport, *, has_lights: bool) -> LaneGraph:
+    """Return the graph with at most `UNCONTROLLED_SPEED` across junctions without lights and signs.
+
+    Priority to the near side does not work at the speed of a main road: whoever turns across it needs longer than
+    faster traffic is in sight.
+
+    Args:
+        graph: The town.
+        report: Takes the junctions that change.
+        has_lights: Add traffic lights to these junctions.
+    """
+    leads_from_sign = np.isin(np.repeat(np.arange(graph.lane_count), np.diff(graph.succ_offset)), graph.rule_lane)
+    signed = graph.junction[graph.succ[leads_from_sign]]
+    uncontrolled = np.setdiff1d(graph.signal_junction[graph.signal_virtual], signed)
+    across = np.isin(graph.junction, uncontrolled) & (graph.kind == LaneType.DRIVING)
+    speed_limit = np.minimum(graph.speed_limit, np.float32(UNCONTROLLED_SPEED))
+    for junction in np.unique(graph.junction[across & (speed_limit < graph.speed_limit)]).tolist():
+        report.note(
+            f"the speed limit across junctions without lights and signs is {UNCONTROLLED_SPEED * 3.6:.0f} km/h",
+            f"junction {junction}",
+        )
+    if has_lights:
+        for junction in uncontrolled.tolist():
+            report.note("traffic lights are added at junctions without lights and signs", f"junction {junction}")
+    return replace(
+        graph,
+        speed_limit=np.where(across, speed_limit, graph.speed_limit),
+        signal_virtual=graph.signal_virtual & ~(np.isin(graph.signal_junction, uncontrolled) & has_lights),
+    )
 
 
 def _name(graph: LaneGraph, lane: int) -> str:

@@ -68,11 +68,11 @@ def test_it_needs_others() -> None:
 
 
 @pytest.mark.slow
-def test_it_raises_the_collision_rate_of_the_autopilot_on_the_road() -> None:
-    found = bases(*range(70))
-    outcomes = search(PaperAdvPPO(found, seeds=[0] * 70, budget=1), found, TRIALS, budget=1)
-    assert sum(base.trace.end == "collision" for base in found) <= 1
-    assert sum(row[0].is_valid for row in outcomes) >= 0.17 * 70
+def test_it_raises_the_collision_rate_of_the_autopilot() -> None:
+    every_base = bases(*range(len(load_scenarios("natural-twinford"))))
+    outcomes = search(PaperAdvPPO(every_base, seeds=[0] * len(every_base), budget=1), every_base, TRIALS, budget=1)
+    assert sum(base.trace.end == "collision" for base in every_base) <= 1
+    assert sum(row[0].collision for row in outcomes) >= 0.15 * len(every_base)
 
 
 def test_weights_are_small() -> None:

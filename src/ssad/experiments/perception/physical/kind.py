@@ -25,10 +25,20 @@ from ssad.experiments.perception.physical.target_attacks import (
     render_all_surfaces,
 )
 from ssad.experiments.perception.physical.target_sheets import write_sheets
-from ssad.experiments.perception.physical.target_table import CLEAN, GRID, TargetTable, rows_of, target_of
+from ssad.experiments.perception.physical.target_table import (
+    APPROACH,
+    CLEAN,
+    DRIVE,
+    GRID,
+    VIEWS,
+    TargetTable,
+    rows_of,
+    target_of,
+)
 from ssad.experiments.perception.physical.verdict import verdict
 from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.experiments.runs import read_plan
+from ssad.metrics.target_approach import approach_scores
 from ssad.metrics.target_grid import grid_scores
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import class_of_target, parse_target
@@ -107,14 +117,16 @@ class Physical(OpenLoopKind):
         for row in rows_of(suite):
             source = row.spec.get("light", row.spec).get("source", "")
             grid = suite.grid.model_dump_json() if suite.grid and row.fields["view"] == GRID else ""
-            inputs = suite.target, suite.place, suite.size, suite.floor, grid, victims.weights.get(source, "")
+            inputs = [suite.target, suite.place, suite.size, suite.floor, grid, victims.weights.get(source, "")]
+            if suite.approach is not None and (row.fields["view"] == APPROACH or row.spec.get("approach")):
+                inputs.append(suite.approach.model_dump_json())
             yield replace(row, inputs=(*inputs, version_of(row.spec)))
         suite.recordings(Path(), "cpu")
 
     def order(self, cell: Cell) -> float:
-        """From behind before from all around; clean first, then controls, then what is trained."""
+        """From behind, on the way to it, from all around; in each clean first, then controls, then what is trained."""
         stage = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
-        return stage + (3 if cell.fields["view"] == GRID else 0)
+        return stage + 3 * VIEWS.index(cell.fields["view"])
 
     def recordings(self, plan: Plan, folder: Path) -> list[TargetRecording]:
         """Return the recordings of the suite."""
@@ -122,8 +134,9 @@ class Physical(OpenLoopKind):
         return suite.recordings(folder, plan.device)
 
     def settings(self, suite: PhysicalSuite, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
-        """Return the target, the floor, and the number of images of the grid."""
-        return {"target": suite.target, "floor": suite.floor, "grid": suite.grid.count if suite.grid else 0}
+        """Return the target, the floor, and the numbers of images of the grid and of an approach."""
+        counts = {GRID: suite.grid.count if suite.grid else 0, APPROACH: suite.approach.images if suite.approach else 0}
+        return {"target": suite.target, "floor": suite.floor, "counts": counts}
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Record the images, and render the visible surface of each carrier once."""
@@ -161,19 +174,25 @@ class Physical(OpenLoopKind):
 
     def target(self, cell: Cell, job: Job, detector: Detector) -> TargetCondition:
         """Return the images in the town of the test, at the hour of the light, and the texture or light."""
-        light, is_grid = cell.spec.get("light"), cell.fields["view"] == GRID
+        light, view = cell.spec.get("light"), cell.fields["view"]
         pair = (light or cell.spec)["pair"]
-        folder = job.folder / "data" / f"{pair['test']}{'-grid' if is_grid else ''}"
-        count = job.settings["grid"] if is_grid else pair["test_images"]
+        folder = job.folder / "data" / f"{pair['test']}{'' if view == DRIVE else f'-{view}'}"
+        count = pair["test_images"] if view == DRIVE else job.settings["counts"][view]
         images = RelightableTargetImages.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
         name = class_of_target(parse_target(job.settings["target"])).replace("_", " ")
-        return TargetCondition(images, perturbation_of(cell, job), f"{name} ({light['hour']})" if light else name)
+        # Far from the target the clean one may be lost: an approach says where.
+        floor = 0.0 if view == APPROACH else None
+        title = f"{name} ({light['hour']})" if light else name
+        return TargetCondition(images, perturbation_of(cell, job), title, floor)
 
     def target_columns(
         self, cell: Cell, job: Job, condition: TargetCondition, clean: Sightings, attacked: Sightings | None
     ) -> dict[str, Any]:
-        """Return the scores of the grid by view, and the record of the texture or light."""
+        """Return the scores by view or by distance, and the record of the texture or light."""
         columns: dict[str, Any] = {}
+        if cell.fields["view"] == APPROACH:
+            bootstrap = {"replicates": job.settings["replicates"], "seed": job.settings["seed"]}
+            columns = approach_scores(condition.images.rows(), clean, attacked, **bootstrap)
         if cell.fields["view"] == GRID:
             columns = grid_scores(condition.images.rows(), clean, attacked, floor=job.settings["floor"])
         perturbation = condition.perturbation

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from ssad.experiments.perception.physical.approach_page import approach_figures, approach_tables
+from ssad.experiments.perception.physical.physical_run import (
+    CONTROLS,
+    PhysicalRun,
+    Shown,
+    floor_of,
+    is_control,
+    learns_nothing,
+    lower,
+    score,
+    title_of,
+)
 from ssad.metrics import replicate_difference
-from ssad.metrics.attack_success import N0, rate_note
+from ssad.metrics.attack_success import rate_note
 from ssad.report.artefacts import pictures
 from ssad.report.figures import HeatMap, heat_maps
 from ssad.report.load import Run
@@ -23,7 +34,6 @@ from ssad.report.tables import Table, TableCell, TableRow
 TEMPLATE = Path(__file__).with_name("page.html")
 
 SOURCE = "published by the paper: CARLA, YoloV5 and YoloV3 fine-tuned there, a camera 20 m behind"
-TITLES = {"adv-patch": "Adv. Patch", "das": "DAS", "tpa": "TPA", "vanishing": "vanishing (strong)"}
 PAPER = {
     ("clean", ""): "Benign",
     ("random", "patch"): "Random patch",
@@ -34,8 +44,6 @@ PAPER = {
 }
 DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name begins -> its column in the paper
 BESIDE = {"Oldmarket": "Town04", "Larkhill": "Town03"}  # town of a test -> the paper's that stands in its place
-LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
-CONTROLS = ("random", "noise", "grey", "shuffled")
 SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class", "n0_25": "n0"}
 OTHERS = {
     "ASR_50": "ASR at 0.5",
@@ -46,116 +54,13 @@ OTHERS = {
     "n0_all_25": "n0, whole class",
     "confidence": "mean score",
 }
+COLOURS = {"delta_e": "colour difference", "outside_gamut": "outside the gamut"}
 VICTIM: dict[str, Callable[[tuple[str, str, tuple[str, str]]], str]] = {
     "Town": lambda row: row[0],
     "Detector": lambda row: row[1],
     "Attack": lambda row: title_of(row[2]),
 }
 """Row factors of a town, a detector and an attack."""
-
-Shown = tuple[str, str, str]
-"""Attack, carrier, and the detector that it was trained against ("" for what is not trained)."""
-
-
-@dataclass(frozen=True)
-class PhysicalRun:
-    """A physical run and its records, several for a control that was drawn several times."""
-
-    run: Run
-
-    @cached_property
-    def records(self) -> Mapping[tuple[str, str, str, Shown], list[Line]]:
-        """Records by town of the test, view, detector, and attack."""
-        lines_by_key: dict[tuple[str, str, str, Shown], list[Line]] = {}
-        for line in self.run.lines:
-            attack_key = (line["attack"], line["carrier"], line["source"])
-            lines_by_key.setdefault((line["test"], line.get("view", "drive"), line["detector"], attack_key), []).append(
-                line
-            )
-        return lines_by_key
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Towns of training and test."""
-        return list(dict.fromkeys((line["train"], line["test"]) for line in self.run.lines))
-
-    @property
-    def detectors(self) -> list[str]:
-        """Detectors that textures were trained against."""
-        return list(self.run.suite["detectors"])
-
-    @property
-    def judges(self) -> list[str]:
-        """All evaluated detectors."""
-        return list(dict.fromkeys(line["detector"] for line in self.run.lines))
-
-    @property
-    def attacks(self) -> list[tuple[str, str]]:
-        """Attacks and controls with their carriers, in the order of the suite, clean first."""
-        return list(dict.fromkeys((line["attack"], line["carrier"]) for line in self.run.lines))
-
-    def lines(
-        self, test: str, view: str, detector: str, attack: tuple[str, str], source: str | None = None
-    ) -> list[Line]:
-        """Records of an attack on a detector, of a texture that was trained against itself unless a source is said."""
-        for trained_against in ((detector if source is None else source), ""):
-            matches = self.records.get((test, view, detector, (*attack, trained_against)))
-            if matches:
-                return [line for line in matches if line["status"] == "ok"]
-        return []
-
-
-def title_of(attack: tuple[str, str]) -> str:
-    """Return the title of an attack or control on a carrier."""
-    name, carrier = attack
-    prefix, _, remainder = name.partition(" ")
-    if carrier.startswith(LIGHT):
-        return f"{name}, {carrier.removeprefix(LIGHT)}"
-    _, _, options = carrier.partition(", ")
-    if prefix == "shuffled":
-        title = f"shuffled {_attack(remainder)}"
-    elif name in CONTROLS:
-        return f"{name} {carrier}"
-    else:
-        title = _attack(name)
-    return f"{title}, {options}" if options else title
-
-
-def _attack(name: str) -> str:
-    """Return the title of an attack's name, which may end in ", all sides"."""
-    prefix, separator, remainder = name.partition(", ")
-    return f"{TITLES.get(prefix, prefix)}{separator}{remainder}"
-
-
-def score(lines: Sequence[Line], metric: str) -> TableCell:
-    """Return a metric in percent, the mean over draws of a control, with its interval.
-
-    The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
-    covers drives and draws. Where a draw has none it is the range of the draws. An attack success rate has no value in
-    records without its n0, which tells whether the clean detector finds enough.
-    """
-    count_name = N0.get(metric)
-    measured = [
-        line
-        for line in lines
-        if line["metrics"].get(metric) is not None and (count_name is None or count_name in line["metrics"])
-    ]
-    if not measured:
-        return TableCell(math.nan)
-    if metric in N0.values():
-        return TableCell.value(measured[0]["metrics"][metric], digits=0)
-    percentages = [100.0 * float(line["metrics"][metric]) for line in measured]
-    mean, count = (
-        math.fsum(percentages) / len(percentages),
-        int(measured[0]["metrics"][count_name] if count_name else measured[0]["n"]),
-    )
-    limits = [interval for line in measured if (interval := (line.get("intervals") or {}).get(metric))]
-    # A draw without an interval has too few drives: only the spread of the draws is known.
-    if len(limits) < len(measured) > 1:
-        return TableCell(mean, min(percentages), max(percentages), count, clusters=len(percentages), method="range")
-    low = 100.0 * min((float(interval[0]) for interval in limits), default=math.nan)
-    high = 100.0 * max((float(interval[1]) for interval in limits), default=math.nan)
-    return TableCell(mean, low, high, count, clusters=int(measured[0]["drives"]), method="given")
 
 
 def main_table(run: PhysicalRun, number: int) -> Table:
@@ -209,11 +114,6 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     )
 
 
-def floor_of(run: Run) -> float:
-    """Return the floor of a run; runs that do not say it have the default of the suite."""
-    return float(run.suite.get("floor", 0.9))
-
-
 def _place(suite: Mapping[str, Any]) -> str:
     """Return the camera positions of a test, in words."""
     kind = str(suite.get("target", "")).partition(":")[0]
@@ -251,32 +151,18 @@ def margin_table(run: PhysicalRun) -> Table:
         "margins",
         "Attacks against controls",
         nearest,
-        rows={**VICTIM, "Nearest control": lambda row: title_of(nearest[row][1])},
+        rows={
+            **VICTIM,
+            "Nearest control": lambda row: title_of(nearest[row][1]),
+            "Proves": lambda row: "nothing" if lower(nearest[row][0]) <= 0.0 else "",
+        },
         columns={"attack": "attack", "control": "control", "difference": "difference"},
         metric=metric,
         note="AP50 in percent. The difference is what a control leaves less what the attack leaves in the same "
         "pictures; its interval is of paired replicates of the bootstrap over drives. Of all controls and all their "
-        "draws it is that with the least lower end; above 0 the attack is stronger than all that learns nothing.",
+        "draws it is that with the least lower end; above 0 the attack is stronger than all that learns nothing, "
+        "elsewhere it proves nothing.",
     )
-
-
-def is_control(name: str) -> bool:
-    """Return whether a row such as "shuffled das" or "random laser" is a control, without training."""
-    return name.split(maxsplit=1)[0] in CONTROLS
-
-
-def learns_nothing(control: str, attack: str) -> bool:
-    """Return whether it is a control of an attack.
-
-    The control of a light ("random laser") counts only for its own kind ("laser, searches 4").
-    """
-    prefix, _, remainder = control.partition(" ")
-    return prefix in CONTROLS and (prefix != "random" or remainder in ("", attack.partition(", ")[0]))
-
-
-def lower(cell: TableCell) -> float:
-    """Return the lower end of a cell's interval, or its number."""
-    return cell.mean if math.isnan(cell.low) else cell.low
 
 
 def transfer_table(run: PhysicalRun) -> Table:
@@ -312,7 +198,9 @@ def others_table(run: PhysicalRun) -> Table:
     def metric(row: tuple[str, str, tuple[str, str]], name: str) -> TableCell:
         test, detector, attack = row
         lines = run.lines(test, "drive", detector, attack)
-        return _difference(lines) if name == "delta_e" else score(lines, name)
+        if name in COLOURS:
+            return _colour_number(lines, name)
+        return score(lines, name)
 
     towns = [test for _, test in run.pairs]
     return Table.listing(
@@ -324,18 +212,23 @@ def others_table(run: PhysicalRun) -> Table:
             if run.lines(test, "drive", detector, attack)
         ],
         rows=VICTIM,
-        columns={**OTHERS, "delta_e": "colour difference"},
+        columns=OTHERS | COLOURS,
         metric=metric,
         note=f"Percent. {rate_note(floor_of(run.run))} The colour difference (CIE 1976) is the mean between a texture "
         "and the paint that it covers: 0 "
-        "for the paint itself, 100 for white on black.",
+        "for the paint itself, 100 for white on black. Outside the gamut: share of the texels that no inks of the "
+        "shipped characterisation give.",
     )
 
 
-def _difference(lines: Sequence[Line]) -> TableCell:
-    """Return the colour difference of a texture to the paint that it covers, the mean over draws of a control."""
-    differences = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
-    return TableCell(math.fsum(differences) / len(differences)) if differences else TableCell(math.nan)
+def _colour_number(lines: Sequence[Line], name: str) -> TableCell:
+    """Return a number of the colours of a texture, the mean over draws of a control; shares in percent."""
+    numbers = [float(line[name]) * (100.0 if name == "outside_gamut" else 1.0) for line in lines if _has(line, name)]
+    return TableCell(math.fsum(numbers) / len(numbers)) if numbers else TableCell(math.nan)
+
+
+def _has(line: Line, name: str) -> bool:
+    return line.get(name) is not None
 
 
 def grid_table(run: PhysicalRun) -> Table:
@@ -470,13 +363,42 @@ def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[t
         for detector in run.detectors:
             grid_lines = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
             heat_map_list = [
-                draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in grid_lines if lines
+                _bracketed(draw(lines[0], title_of(attack), clean=attack[0] == "clean"), attack, grid_lines, draw)
+                for attack, lines in grid_lines
+                if lines
             ]
             if heat_map_list:
                 entries.append(
                     (f"{detector}, {test}", heat_maps(heat_map_list, label=f"{label}, {detector} in {test}"))
                 )
     return entries
+
+
+def _bracketed(
+    heat_map: HeatMap,
+    attack: tuple[str, str],
+    grid_lines: Sequence[tuple[tuple[str, str], list[Line]]],
+    draw: Callable[..., HeatMap],
+) -> HeatMap:
+    """Return the map of an attack with brackets where a control of its carrier leaves no more: it proves nothing there.
+
+    Maps of the clean target and of controls stay as they are.
+    """
+    name, carrier = attack
+    if name == "clean" or is_control(name):
+        return heat_map
+    control_maps = [
+        draw(line, "", clean=False)
+        for (control, control_carrier), lines in grid_lines
+        if control_carrier == carrier and learns_nothing(control, name)
+        for line in lines
+    ]
+    unproven = set()
+    for position, value in heat_map.values.items():
+        controls = [control_map.values.get(position) for control_map in control_maps]
+        if value is not None and any(control is not None and control <= value for control in controls):
+            unproven.add(position)
+    return replace(heat_map, bracketed=frozenset(unproven))
 
 
 def _weather_map(line: Line, title: str, *, clean: bool) -> HeatMap:
@@ -555,12 +477,15 @@ def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence
     """Return the page of a physical run and its tables."""
     run = PhysicalRun(stored_run)
     main_tables = [main_table(run, number) for number in range(len(run.pairs))]
+    distance_tables = approach_tables(run)
     margin_rows, others, effort = margin_table(run), others_table(run), effort_table(run)
     further_tables = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
         TEMPLATE,
         stored_run,
         verdict=verdict,
+        figures=approach_figures(run),
+        distances=distance_tables,
         main=main_tables,
         margins=margin_rows,
         further=further_tables,
@@ -582,4 +507,4 @@ def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence
             for line in stored_run.failures
         ],
     )
-    return page, [*main_tables, margin_rows, *further_tables, others, effort]
+    return page, [*distance_tables, *main_tables, margin_rows, *further_tables, others, effort]

@@ -33,6 +33,7 @@ from ssad.scenarios.static.physical.lights import SearchView, TargetSize
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
 from ssad.scenarios.static.physical.textures.carrier import covered_colour
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
+from ssad.scenarios.static.physical.textures.inks import share_outside
 from ssad.scenarios.static.physical.textures.perturbation import wearing_images
 from ssad.scenarios.static.physical.textures.printing import conspicuousness
 
@@ -167,7 +168,8 @@ class TrainedTexture(Perturbation):
         surface = surface_of(attacks.target, spec.surface)
 
         def views() -> list[TextureView]:
-            image_sets = [attacks.images(spec.pair["train"], spec.pair["train_images"], spec.source)]
+            recording = f"{spec.pair['train']}-approach" if spec.approach else spec.pair["train"]
+            image_sets = [attacks.images(recording, spec.pair["train_images"], spec.source)]
             if spec.around:
                 image_sets.append(attacks.images(f"{spec.pair['train']}-around", spec.around, spec.source))
             return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
@@ -182,12 +184,18 @@ class TrainedTexture(Perturbation):
         return wearing_images(images, albedo_of(self.make()), surface_of(self.attacks.target, self.spec.surface))
 
     def about(self) -> dict[str, Any]:
-        """Return the record of the texture: its file, the distance of its colours from the paint, and its training."""
+        """Return the record of the texture: its file, its colours beside paint and inks, and its training."""
         textures, spec, target = self.attacks.textures, self.spec, self.attacks.target
         artefacts = {"texture": str(textures.image_path(spec).relative_to(self.attacks.folder))}
         mask = torch.from_numpy(surface_of(target, spec.surface).mask.copy())
-        colour_distance = conspicuousness(albedo_of(self.make().detach()), paint_under(target, spec.surface), mask)
-        return {"artefacts": artefacts, "delta_e": round(float(colour_distance), 2), **textures.history(spec)}
+        colour = self.make().detach()
+        colour_distance = conspicuousness(albedo_of(colour), paint_under(target, spec.surface), mask)
+        return {
+            "artefacts": artefacts,
+            "delta_e": round(float(colour_distance), 2),
+            "outside_gamut": round(share_outside(colour, mask), 6),
+            **textures.history(spec),
+        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ from ssad.scenarios.static.physical.lights.folder import budget_of
 from ssad.scenarios.static.physical.textures.card import load_texture
 
 CLEAN, RANDOM = "clean", "random"
-GRID = "grid"
-VIEWS = ("drive", GRID)
+DRIVE, APPROACH, GRID = "drive", "approach", "grid"
+VIEWS = (DRIVE, APPROACH, GRID)
 
 
 class Pair(Schema):
@@ -75,6 +75,25 @@ class Grid(Schema):
         return len(self.distances) * len(self.azimuths) * len(self.elevations) * len(self.weathers)
 
 
+class Approach(Schema):
+    """Views on the way to the target, from far to near: in each town of a test, and of a training.
+
+    The camera has the focal length of all recordings, 1.1 times the side of the image. A car 1.43 m high is 80 m away
+    25 px high in images of 1280 px.
+
+    Attributes:
+        distances: distances to the target, m: of a car of way behind it, of another target in the air.
+        images: number of images in each town of a test; 25 are of one drive.
+        size: side of the images, px, also of those that textures are trained on.
+        train: whether textures are trained on views at these distances, in place of those of the test.
+    """
+
+    distances: list[float] = Field(default=[5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0], min_length=2)
+    images: int = Field(default=500, ge=1)
+    size: int = Field(default=1280, ge=64)
+    train: bool = True
+
+
 class Entry(Schema):
     """Row of the table.
 
@@ -90,6 +109,7 @@ class Entry(Schema):
             set here; among several such rows, the one that sets nothing beyond the others.
         texture: a shipped texture, or the card of one (NAME.json), that is shown instead of training one; carrier,
             options and the detector of its training are those of the card.
+        project: for a texture: whether its colours are first moved to the nearest that inks can give.
     """
 
     name: str = Field(min_length=1)
@@ -99,6 +119,7 @@ class Entry(Schema):
     around: int = Field(default=0, ge=0)
     of: str | None = None
     texture: str | None = None
+    project: bool = False
 
 
 class TargetLightEntry(Schema):
@@ -136,7 +157,10 @@ class TargetTable(Schema):
         window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
             whole images, as for 3D detectors always. A window of 192 takes a sixth of the time.
         seeds: draws of each control that is random.
+        inks: whether textures are trained in tones of inks, and controls have colours that inks can give; False: any
+            colour, which no printer may give.
         grid: views from all around, beside those from behind; None: none.
+        approach: views on the way to the target, beside those from behind; None: none.
         behind: distance from the camera to a driving car, m.
         distances: distances from the camera to any other target, m.
         size: side of the images, px.
@@ -154,7 +178,9 @@ class TargetTable(Schema):
     epochs: int | None = Field(default=None, ge=1)
     window: int | None = None
     seeds: int = Field(default=3, ge=1)
+    inks: bool = True
     grid: Grid | None = None
+    approach: Approach | None = None
     behind: float = Field(default=20.0, ge=3.0, le=60.0)
     distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0], min_length=1)
     size: int = Field(default=640, ge=64)
@@ -181,33 +207,60 @@ class TargetTable(Schema):
         """Return True if the test of a pair includes the grid."""
         return self.grid is not None and (self.grid.towns is None or pair.test in self.grid.towns)
 
+    @property
+    def training_size(self) -> int:
+        """Side of the images that textures are trained on, px."""
+        return self.approach.size if self.approach is not None and self.approach.train else self.size
+
     def recordings(self, folder: Path, device: str) -> list[TargetRecording]:
-        """What is recorded below a folder: drives of each town, the grid, and views from all around for trainings.
+        """What is recorded below a folder: drives of each town, approaches, the grid, and views from all around.
 
         Raises:
             ConfigError: A value that cannot be.
             UnknownNameError: A town, or a weather.
         """
         images: dict[str, int] = {}
+        approach_images: dict[str, int] = {}
+        trains_on_approach = self.approach is not None and self.approach.train
         for pair in self.pairs:
             for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
-                # A town may train one pair and test another; one recording serves both.
-                images[town] = max(images.get(town, 0), count)
+                # A town may train one pair and test another; one recording serves both. Lights are searched from
+                # behind, whatever textures are trained on.
+                is_needed = town == pair.test or self.lights or not trains_on_approach
+                images |= {town: max(images.get(town, 0), count)} if is_needed else {}
+            if self.approach is not None:
+                counts = {pair.test: self.approach.images} | (
+                    {pair.train: pair.train_images} if self.approach.train else {}
+                )
+                for town, count in counts.items():
+                    approach_images[town] = max(approach_images.get(town, 0), count)
         target = target_of(self)
-        make_recording = partial(
-            TargetRecording, held_out=(), target=target, size=self.size, seed=self.seed, device=device
-        )
+        make_recording = partial(TargetRecording, held_out=(), target=target, seed=self.seed, device=device)
         mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
         recordings_by_name = [
             make_recording(
                 folder / "data" / town,
                 ((town, count),),
                 mode=mode,
+                size=self.size,
                 behind=self.behind,
                 distances=tuple(self.distances),
             )
             for town, count in images.items()
         ]
+        if self.approach is not None:
+            distances = {"approach" if mode == "drive" else "distances": tuple(self.approach.distances)}
+            recordings_by_name += [
+                make_recording(
+                    folder / "data" / f"{town}-{APPROACH}",
+                    ((town, count),),
+                    mode=mode,
+                    size=self.approach.size,
+                    behind=self.behind,
+                    **distances,  # type: ignore[arg-type]
+                )
+                for town, count in approach_images.items()
+            ]
         if self.grid is not None:
             grid = self.grid
             recordings_by_name += [
@@ -215,6 +268,7 @@ class TargetTable(Schema):
                     folder / "data" / f"{town}-grid",
                     ((town, grid.count),),
                     mode="orbit",
+                    size=self.size,
                     distances=tuple(grid.distances),
                     azimuths=tuple(grid.azimuths),
                     elevations=tuple(grid.elevations),
@@ -225,7 +279,9 @@ class TargetTable(Schema):
         around_count = max((entry.around for entry in self.attacks), default=0)
         for town in dict.fromkeys(pair.train for pair in self.pairs) if around_count else ():
             recordings_by_name.append(
-                make_recording(folder / "data" / f"{town}-around", ((town, around_count),), mode="orbit")
+                make_recording(
+                    folder / "data" / f"{town}-around", ((town, around_count),), mode="orbit", size=self.training_size
+                )
             )
         return recordings_by_name
 
@@ -246,7 +302,7 @@ def rows_of(table: TargetTable) -> Iterator[CellDescription]:
             raise ConfigError(f"attack {row['attack']}: {error}") from None
     titled_rows = [({"attack": None}, CLEAN), *((row, _title(table, row, entry_rows)) for row in entry_rows)]
     for pair, view, detector in product(table.pairs, VIEWS, [*table.detectors, *table.judges]):
-        if view == GRID and not table.seen_around(pair):
+        if (view == GRID and not table.seen_around(pair)) or (view == APPROACH and table.approach is None):
             continue
         for row, title in titled_rows if entry_rows or not table.lights else []:
             yield from _texture_rows(table, pair, view, detector, row, title)
@@ -264,6 +320,8 @@ def _texture_rows(  # noqa: PLR0917
     seeds = range(table.seeds) if attack in ("random", "noise", "shuffled") else (0,)
     for source, seed in product(sources, seeds):
         spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
+        if is_trained and table.approach is not None and table.approach.train:
+            spec["approach"] = True
         spec["source"] = source if is_trained else ""
         fields = {
             "test": pair.test,
@@ -276,7 +334,7 @@ def _texture_rows(  # noqa: PLR0917
             "number": seed,
         }
         title_parts = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
-        title = "/".join(map(str, title_parts)) + (f"/{GRID}" if view == GRID else "")
+        title = "/".join(map(str, title_parts)) + (f"/{view}" if view != DRIVE else "")
         yield CellDescription(title, detector, fields, spec)
 
 
@@ -336,6 +394,7 @@ def _stated_settings(table: TargetTable, row: Mapping[str, Any]) -> dict[str, An
     """Return the settings of a row beyond its attack, its carrier and the defaults of the table."""
     table_defaults = {"epochs": table.epochs, "window": table.window}
     further = {"around": row["around"] or None, "texture": row.get("file")}
+    further |= {"project": True} if row.get("file") and row["inks"] else {}
     return {key: value for key, value in {**row["settings"], **further}.items() if value != table_defaults.get(key)}
 
 
@@ -386,9 +445,11 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
         return {**_shuffled(table, entry), "attack": "shuffled", "of": entry.of}
     carrier = entry.carrier or default_carrier(entry.name)
     row: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
-    row |= {"of": None, "around": entry.around}
+    row |= {"of": None, "around": entry.around, "inks": table.inks}
+    if entry.project and entry.texture is None:
+        raise ConfigError(f"suite {table.name}: {entry.name}: project is for a texture; others have colours of inks")
     if entry.texture is not None:
-        return row | _card_fields(table, entry)
+        return row | _card_fields(table, entry) | {"inks": entry.project}
     if entry.name not in CONTROLS:
         settings = {"epochs": table.epochs, "window": table.window}
         settings = {key: value for key, value in settings.items() if value is not None} | entry.settings

@@ -25,6 +25,8 @@ from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
 from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS
+from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.render import Rendering, render
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
@@ -34,6 +36,7 @@ from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generat
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
+RECORDED_SENSOR = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +69,7 @@ class TexturableImage:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
-        sensor: SensorModel = SENSOR,
+        sensor: SensorModel = RECORDED_SENSOR,
         device: str | torch.device = "cpu",
     ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
@@ -334,6 +337,9 @@ def visible_part(picture: Rendering) -> dict[str, Any]:
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
     (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
+    if with_lens_effects(SENSOR, picture.effects).scatters:
+        # The lens carries light from everywhere to everywhere.
+        (top, bottom), (left, right) = (0, height), (0, width)
     fragments = picture.fragments.copy()
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ssad.experiments.perception.physical import page as physical
+from ssad.experiments.perception.physical import physical_run as physical
 from ssad.metrics.attack_success import N0
 from ssad.report.load import Run
 from ssad.report.records import Line, metric_of

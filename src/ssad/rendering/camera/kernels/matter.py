@@ -26,7 +26,7 @@ class Surface:
         emission: Emission by day.
         night: Additional emission at night.
         paint: 1 where it takes the paint of its body.
-        lamp: 1 where it shines only while the lamps of its body are on.
+        lamp: Kind of lamp, such as `ssad.rendering.camera.kernels.light.HEAD_LAMP`; 0 for none.
         pattern: Such as `BRICK`.
     """
 

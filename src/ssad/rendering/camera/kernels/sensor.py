@@ -10,7 +10,7 @@ class Response:
     """Sensor of a view.
 
     Attributes:
-        exposure: Factor of the light.
+        exposure: Factor of the light, RGB.
         centre: Weight of a pixel in the lens's blur along an axis.
         side: Weight of each of its two neighbours.
         full: Light at which a photosite is full.
@@ -18,9 +18,11 @@ class Response:
         dark: Standard deviation without light.
         seed: Seed of the noise.
         mosaic: 1 for a sensor with a colour mosaic.
+        curve: Row of its curve.
+        saturation: Distance of colours from grey, over that of the light.
     """
 
-    exposure: float
+    exposure: wp.vec3
     centre: float
     side: float
     full: float
@@ -28,6 +30,8 @@ class Response:
     dark: float
     seed: int
     mosaic: int
+    curve: int
+    saturation: float
 
 
 @wp.func
@@ -41,10 +45,43 @@ def mirrored(index: int, count: int) -> int:
 
 
 @wp.func
-def code_of(curve: wp.array(dtype=wp.uint8), light: float) -> wp.uint8:
+def code_of(curves: wp.array2d(dtype=wp.uint8), row: int, light: float) -> wp.uint8:
     """Look up the camera's curve, listed over the square root of light in 0..4."""
-    position = wp.sqrt(wp.clamp(light, 0.0, 3.999)) * 0.5 * float(curve.shape[0])
-    return curve[int(position)]
+    position = wp.sqrt(wp.clamp(light, 0.0, 3.999)) * 0.5 * float(curves.shape[1])
+    return curves[row, int(position)]
+
+
+@wp.func
+def saturated(light: float, grey: float, saturation: float) -> float:
+    """Return a colour at another distance from its grey."""
+    return light * saturation + grey * (1.0 - saturation)
+
+
+@wp.func
+def put(
+    out: wp.array4d(dtype=wp.uint8),
+    view: int,
+    y: int,
+    x: int,
+    red: float,
+    green: float,
+    blue: float,
+    saturation: float,
+    row: int,
+    curves: wp.array2d(dtype=wp.uint8),
+):
+    """Write the codes of a pixel by a row of the curves."""
+    final_red = red
+    final_green = green
+    final_blue = blue
+    if saturation != 1.0:
+        grey = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+        final_red = saturated(red, grey, saturation)
+        final_green = saturated(green, grey, saturation)
+        final_blue = saturated(blue, grey, saturation)
+    out[view, y, x, 0] = code_of(curves, row, final_red)
+    out[view, y, x, 1] = code_of(curves, row, final_green)
+    out[view, y, x, 2] = code_of(curves, row, final_blue)
 
 
 @wp.func
@@ -81,7 +118,7 @@ def site(
         spread_row(radiance, b, above, left, x, right, c, response)
         + spread_row(radiance, b, below, left, x, right, c, response)
     )
-    light = light * response.exposure
+    light = light * response.exposure[c]
     if response.dark > 0.0:
         # Seeded by the position: noise does not depend on the order of the threads.
         state = wp.rand_init(response.seed, y * radiance.shape[2] + x)
@@ -125,7 +162,7 @@ def expose(
 def develop(
     raw: wp.array3d(dtype=float),
     responses: wp.array(dtype=Response),
-    curve: wp.array(dtype=wp.uint8),
+    curves: wp.array2d(dtype=wp.uint8),
     out: wp.array4d(dtype=wp.uint8),
 ):
     """Develop photosites to 8 bits out [B, H, W, 3], for views with a mosaic.
@@ -134,8 +171,11 @@ def develop(
     thread handles a square of four.
     """
     view, row, column = wp.tid()
-    if responses[view].mosaic == 0:
+    response = responses[view]
+    if response.mosaic == 0:
         return
+    saturation = response.saturation
+    curve = response.curve
     height = raw.shape[1]
     width = raw.shape[2]
     y2 = 2 * row
@@ -178,39 +218,31 @@ def develop(
     # red's site
     green = 0.5 * r21 + 0.25 * (g20 + g21 + g10 + g31) - 0.125 * (r20 + r22 + r00 + r41)
     blue = 0.75 * r21 + 0.25 * (b10 + b11 + b30 + b31) - 0.1875 * (r20 + r22 + r00 + r41)
-    out[view, y2, x2, 0] = code_of(curve, r21)
-    out[view, y2, x2, 1] = code_of(curve, green)
-    out[view, y2, x2, 2] = code_of(curve, blue)
+    put(out, view, y2, x2, r21, green, blue, saturation, curve, curves)
     if x2 + 1 < width:
         # green's, red left and right
         near = 0.625 * g21 - 0.125 * (g10 + g11 + g31 + g32)
         red = near + 0.5 * (r21 + r22) - 0.125 * (g20 + g22) + 0.0625 * (g01 + g41)
         blue = near + 0.5 * (b11 + b31) - 0.125 * (g01 + g41) + 0.0625 * (g20 + g22)
-        out[view, y2, x3, 0] = code_of(curve, red)
-        out[view, y2, x3, 1] = code_of(curve, g21)
-        out[view, y2, x3, 2] = code_of(curve, blue)
+        put(out, view, y2, x3, red, g21, blue, saturation, curve, curves)
     if y2 + 1 < height:
         # green's, red above and below
         near = 0.625 * g31 - 0.125 * (g20 + g21 + g40 + g41)
         red = near + 0.5 * (r21 + r41) - 0.125 * (g10 + g51) + 0.0625 * (g30 + g32)
         blue = near + 0.5 * (b30 + b31) - 0.125 * (g30 + g32) + 0.0625 * (g10 + g51)
-        out[view, y3, x2, 0] = code_of(curve, red)
-        out[view, y3, x2, 1] = code_of(curve, g31)
-        out[view, y3, x2, 2] = code_of(curve, blue)
+        put(out, view, y3, x2, red, g31, blue, saturation, curve, curves)
     if x2 + 1 < width and y2 + 1 < height:
         # blue's
         green = 0.5 * b31 + 0.25 * (g31 + g32 + g21 + g41) - 0.125 * (b30 + b32 + b11 + b51)
         red = 0.75 * b31 + 0.25 * (r21 + r22 + r41 + r42) - 0.1875 * (b30 + b32 + b11 + b51)
-        out[view, y3, x3, 0] = code_of(curve, red)
-        out[view, y3, x3, 1] = code_of(curve, green)
-        out[view, y3, x3, 2] = code_of(curve, b31)
+        put(out, view, y3, x3, red, green, b31, saturation, curve, curves)
 
 
 @wp.kernel
 def develop_plain(
     radiance: wp.array3d(dtype=wp.vec3),
     responses: wp.array(dtype=Response),
-    curve: wp.array(dtype=wp.uint8),
+    curves: wp.array2d(dtype=wp.uint8),
     out: wp.array4d(dtype=wp.uint8),
 ):
     """Develop light to 8 bits out [B, H, W, 3], for views without a mosaic: every photosite has three colours."""
@@ -238,10 +270,11 @@ def develop_plain(
             response.centre * response.side
         )
         light += diagonal * (response.side * response.side)
-    light = light * response.exposure
+    light = wp.cw_mul(light, response.exposure)
     if response.dark > 0.0:
         state = wp.rand_init(response.seed, y * width + x)
         for channel in range(3):
             light[channel] = filled(response, light[channel], wp.randn(state))
     for channel in range(3):
-        out[view, y, x, channel] = code_of(curve, wp.min(light[channel], response.full))
+        light[channel] = wp.min(light[channel], response.full)
+    put(out, view, y, x, light[0], light[1], light[2], response.saturation, response.curve, curves)

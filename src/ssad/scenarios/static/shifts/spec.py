@@ -41,7 +41,7 @@ PLACING: Final = ("anomaly",)  # shifts that add objects to the scene
 CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
-VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
+VERSIONS: Final[dict[Calibration, int]] = {"physical": 4, "paper": 3}
 # the same of LiDAR points alone; random numbers do not depend on it
 LIDAR_VERSIONS: Final[dict[Calibration, int]] = {"physical": 1, "paper": 2}
 

@@ -172,6 +172,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
         centres = draws.uniform(0, 1, (max_drops, 2)) * [batch.width, batch.height]
         radius = np.minimum(np.exp(draws.normal(2.3, 0.55, max_drops)), 40) * batch.width / 1600
         aspect = draws.uniform(1.0, 1.4, max_drops)
+        phases = draws.uniform(0, 2 * np.pi, (max_drops, 2))
         for drop_index in range(_lens_drop_count(spec)):
             lens_drops.append(
                 (
@@ -180,6 +181,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
                     float(centres[drop_index, 1]),
                     max(float(radius[drop_index]), 1.5),
                     float(aspect[drop_index]),
+                    *phases[drop_index].tolist(),
                 )
             )
     return lens_drops
@@ -231,9 +233,13 @@ def add_precipitation(
         offsets = to_device(
             batch, np.searchsorted([lens_drop[0] for lens_drop in lens_drops], np.arange(batch.count + 1)), wp.int32
         )
-        batch.launch(
-            particles.refract, thread_shape, [batch.data, drop_rows, offsets, batch.height, batch.width], result.data
-        )
+        coarse_shape = tuple(-(-size // int(particles.BLOCK)) for size in (batch.height, batch.width))
+        coarse = wp.empty((batch.count, *coarse_shape), dtype=wp.vec3, device=batch.device)
+        linear, codes = tables(batch.device)
+        inputs = [batch.data, linear, batch.height, batch.width]
+        batch.launch(particles.blur_coarsely, (batch.count, coarse_shape[0]), inputs, coarse)
+        inputs = [coarse, drop_rows, offsets, linear, codes, batch.height, batch.width]
+        batch.launch(particles.refract, thread_shape, inputs, result.data)
     rates = [(table.SNOW_RATE if spec.name == "snow" else table.RAIN_RATE)[spec.severity - 1] for spec in specs]
     records = [
         ShiftReport(

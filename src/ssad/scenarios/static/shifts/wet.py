@@ -56,9 +56,11 @@ def wet_ground(
         [depth, ground, cell_light, lenses, to_ego, to_world, keys, film, roughness],
         shine,
     )
+    soft_shine = wp.empty_like(shine)
+    batch.launch(kernels.soften, thread_shape, [shine, ground], soft_shine)
     darkening = to_device(batch, [table.WET_DARK[spec.severity - 1] for spec in specs])
     result = batch.empty_like()
-    inputs = [batch.words(), ground, shine, mean_light, darkening, linear, codes, batch.width, batch.stride // 4]
+    inputs = [batch.words(), ground, soft_shine, mean_light, darkening, linear, codes, batch.width, batch.stride // 4]
     batch.launch(kernels.blend_wet, (batch.count, batch.height), inputs, result.words())
     return result
 

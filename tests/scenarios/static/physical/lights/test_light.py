@@ -35,7 +35,7 @@ from ssad.scenarios.static.physical.lights import (
     search,
 )
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec, budget_of
-from ssad.scenarios.static.physical.lights.laser import colour_matching
+from ssad.scenarios.static.physical.lights.laser import TO_SRGB, colour_matching, spectral_colour
 from ssad.scenarios.static.physical.lights.light import LightAttack, Ranges, value_tensors
 from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitImage, render_lit_image
 
@@ -170,6 +170,25 @@ def test_the_eye_sees_green_and_not_infrared() -> None:
     assert found == pytest.approx(
         np.array([[0.336, 0.038, 1.772], [0.512, 1.0, 0.0057], [0.2835, 0.107, 0.0]]), abs=0.03
     )
+
+
+def test_a_laser_is_as_bright_as_the_eye_sees_its_wavelength() -> None:
+    """Luminance of the displayed colour against the luminosity function; the hue is that of the wavelength."""
+    wavelength = torch.linspace(400.0, 690.0, 59, dtype=torch.float64, requires_grad=True)
+    xyz = colour_matching(wavelength)
+    colour = spectral_colour(wavelength)
+    to_xyz = torch.linalg.inv(torch.tensor(TO_SRGB, dtype=torch.float64))
+    assert (colour @ to_xyz[1]).detach().numpy() == pytest.approx(xyz[:, 1].detach().numpy(), rel=2e-3, abs=1e-9)
+    smallest = colour.detach().amin(-1).numpy()
+    assert smallest.min() >= 0.0
+    assert smallest.max() < 1e-12, "as pure as the display can show"
+    # On the line from white to the wavelength: its distance from grey is a share of that of the pure colour.
+    grey = xyz[:, 1:2]
+    share = (colour - grey) / (xyz @ xyz.new_tensor(TO_SRGB).T - grey)
+    assert share.amax(-1).detach().numpy() == pytest.approx(share.amin(-1).detach().numpy(), abs=1e-6)
+    colour.sum().backward()
+    assert wavelength.grad is not None
+    assert bool(torch.isfinite(wavelength.grad).all())
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from ssad.scenarios.static.physical.textures.attention import (
 )
 from ssad.scenarios.static.physical.textures.carrier import TextureSurface, albedo_of
 from ssad.scenarios.static.physical.textures.controls import control
+from ssad.scenarios.static.physical.textures.inks import project_onto_gamut, share_outside
 from ssad.scenarios.static.physical.textures.optimise import (
     TARGET,
     TextureAttack,
@@ -39,7 +40,9 @@ from tests.scenarios.static.digital.toy_detector import CELL, ToyDetector, patte
 
 SURFACE = TextureSurface(TextureLayer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
 GAIN = 0.2
-PLAIN = TextureAttack("plain", "hide", epochs=12, rate=0.1, batch=2, smooth=0.0, printed=0.0, expectation=NOMINAL)
+PLAIN = TextureAttack(
+    "plain", "hide", epochs=12, inks=False, rate=0.1, batch=2, smooth=0.0, printed=0.0, expectation=NOMINAL
+)
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,20 @@ def test_a_trained_texture_beats_all_that_learn_nothing() -> None:
     others.append(trained.colour.flatten(1).flip(1).reshape(trained.colour.shape))
     assert own < 0.5 * min(score(other, fresh) for other in others)
     assert bool((torch.sign(0.5 - trained.colour) == pattern("car")).float().mean() > 0.95)
+
+
+def test_a_texture_of_inks_can_be_printed_and_still_beats_controls() -> None:
+    """The same training over any colours leaves the gamut, so the share outside is 0 for a reason."""
+    start, size = control("grey", SURFACE.size), SURFACE.size
+    any_colour = train_texture(PLAIN, detector(), SURFACE, views(), start=start)
+    printed = train_texture(replace(PLAIN, inks=True), detector(), SURFACE, views(), start=start)
+    assert share_outside(any_colour.colour) > 0.5
+    assert share_outside(printed.colour) == 0.0
+    assert torch.equal(project_onto_gamut(printed.colour), printed.colour)
+    fresh = views(seed=9)
+    controls = [project_onto_gamut(control(name, size, seed=k)) for name in ("random", "noise") for k in range(3)]
+    assert score(any_colour.colour, fresh) < score(printed.colour, fresh)
+    assert score(printed.colour, fresh) < 0.7 * min(score(other, fresh) for other in [start, *controls])
 
 
 def test_an_epoch_has_each_picture_once_unless_a_share_goes_to_the_worst() -> None:

@@ -120,6 +120,14 @@ def colour_matching(wavelength: Tensor) -> Tensor:
 def spectral_colour(wavelength: Tensor) -> Tensor:
     """Return the linear RGB [N, 3] of light of wavelengths [N] in nm, for a power in lumen at 555 nm.
 
-    White light of the same luminance is (y, y, y). Components outside the gamut of sRGB are clipped at 0.
+    White light of the same luminance is (y, y, y). Every spectral colour lies outside the gamut of sRGB: it is mixed
+    with white of its own luminance until no component is negative. Luminance and dominant wavelength stay the same,
+    only the purity falls.
     """
-    return (colour_matching(wavelength) @ wavelength.new_tensor(TO_SRGB).T).clamp_min(0.0)
+    xyz = colour_matching(wavelength)
+    luminance = xyz[:, 1:2]
+    colour = xyz @ wavelength.new_tensor(TO_SRGB).T
+    # Equal to 1 inside the gamut; at its border, the most negative component becomes 0.
+    purity = luminance / (luminance - colour.amin(-1, keepdim=True).clamp_max(0.0)).clamp_min(1e-12)
+    # The smallest component is 0 but for rounding, which must not leave a negative light.
+    return (luminance + purity * (colour - luminance)).clamp_min(0.0)

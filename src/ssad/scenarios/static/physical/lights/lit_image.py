@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.types import F64
+from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import View, render, scene_light
 from ssad.rendering.camera.scene import RenderScene
@@ -69,7 +70,9 @@ class LitImage:
         """
         crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
         (top, left), (height, width) = self.corner, self.radiance.shape[:2]
-        margin = 4 if min(height, width) > 16 else 0  # at the border of the part the lens lacks what lies beyond it
+        is_whole = (height, width) == self.before.shape[2:]
+        # At the border of the part the lens lacks what lies beyond it.
+        margin = 4 if min(height, width) > 16 and not is_whole else 0
         full_images = self.before.repeat(len(change), 1, 1, 1)
         rows, columns = slice(margin, height - margin), slice(margin, width - margin)
         full_images[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = crop[
@@ -100,6 +103,10 @@ def render_lit_image(
         device: Device of the images.
     """
     rendering = render(scene, [view], surface=True)
+    sensor = with_lens_effects(view.sensor, rendering.effects)
+    if sensor.scatters:
+        # The lens carries light from everywhere to everywhere.
+        rows, columns = slice(0, view.camera.height), slice(0, view.camera.width)
     surface, crop = rendering.surface, (0, rows, columns)
     assert surface is not None
     pose = next(scene_object.pose for scene_object in view.objects if scene_object.tag == tag)
@@ -126,5 +133,5 @@ def render_lit_image(
         float(rendering.exposure[0]),
         per_lux(view.weather),
         view.weather.fog,
-        view.sensor,
+        sensor,
     )

@@ -108,6 +108,7 @@ class Projector:
             "epochs": 40,
             "rate": 0.1,
             "smooth": 0.02,
+            "inks": False,
             "printed": 0.0,
             "window": 320,
             "expectation": AIMED,
@@ -117,6 +118,8 @@ class Projector:
             options["expectation"] = {**asdict(AIMED), **options["expectation"]}
         label = f"attack {self.name}"
         attack = build_validated(partial(TextureAttack, self.name), options, subject=label, kind=TextureAttack)
+        if attack.inks:
+            raise ConfigError(f"{label}: inks=true: a projector's image is light, not print")
         if attack.stealth:
             raise ConfigError(f"{label}: stealth={attack.stealth:g}: it is for what is printed on something")
         return attack

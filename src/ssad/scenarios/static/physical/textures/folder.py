@@ -19,7 +19,7 @@ from ssad.scenarios.static.physical.textures.attacks import make_physical
 from ssad.scenarios.static.physical.textures.card import load_texture
 from ssad.scenarios.static.physical.textures.carrier import TextureSurface
 from ssad.scenarios.static.physical.textures.controls import control, texture_picture
-from ssad.scenarios.static.physical.textures.inks import printable_colours
+from ssad.scenarios.static.physical.textures.inks import printable_colours, project_onto_gamut
 from ssad.scenarios.static.physical.textures.optimise import TextureView, train_texture
 from ssad.scenarios.static.physical.textures.spec import TextureSpec
 
@@ -73,10 +73,14 @@ class TextureFolder:
         if spec.source:
             is_trained = spec.file is None
             colour = self._train(spec, surface, views, detector, paint) if is_trained else _read(spec, surface)
+            if spec.inks and not is_trained:
+                colour = project_onto_gamut(colour)
             if spec.attack == "shuffled":
                 colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
         else:
             colour = control(spec.attack, surface.size, seed=spec.number)
+            if spec.inks:
+                colour = project_onto_gamut(colour)
         if not self.image_path(spec).is_file():
             save_picture(self.image_path(spec), texture_picture(colour, surface.mask))
         return colour
@@ -92,7 +96,7 @@ class TextureFolder:
         path = self.colour_path(spec)
         if not path.is_file():
             trained = train_texture(
-                make_physical(spec.trained, **spec.settings),
+                make_physical(spec.trained, **{"inks": spec.inks, **spec.settings}),
                 detector(),
                 surface,
                 views(),

@@ -22,6 +22,7 @@ from ssad.core.seeding import digest, generator
 from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
 from ssad.scenarios.static.physical.textures.carrier import TextureSurface, albedo_of
+from ssad.scenarios.static.physical.textures.inks import clamp_tones, ink_colour, project_onto_gamut, tones_of
 from ssad.scenarios.static.physical.textures.printing import (
     Expectation,
     conspicuousness,
@@ -77,12 +78,14 @@ class TextureAttack:
         name: Name shown in tables.
         objective: Loss to ascend, or its name.
         epochs: Passes over all images.
-        rate: Learning rate, in units of colour (0 to 1).
+        inks: Whether the texels are tones of inks on paper, so that whatever is learned can be printed
+            (`ssad.scenarios.static.physical.textures.inks`); False: any colour.
+        rate: Learning rate, in units of tones, or of colour (0 to 1).
         optimiser: adam, or sgd with momentum 0.9.
         decay: Weight decay towards mid-grey.
         batch: Images per step.
         smooth: Weight of the total variation.
-        printed: Weight of the non-printability.
+        printed: Weight of the non-printability, of texels of any colour; tones of inks need none.
         stealth: Weight of the conspicuousness, of 100: the distance of the colours from those that the texture
             covers.
         expectation: Variation between prints.
@@ -95,6 +98,7 @@ class TextureAttack:
     name: str
     objective: Annotated[str | Objective, PlainValidator(_loss)] = "hide"
     epochs: Whole = 20
+    inks: bool = True
     rate: Above = 0.04
     optimiser: Literal["adam", "sgd"] = "adam"
     decay: Least = 0.0
@@ -112,7 +116,7 @@ class TextureTrainingResult:
     """Trained texture and its training history.
 
     Attributes:
-        colour: sRGB [3, H, W] in 0 to 1, on the CPU.
+        colour: sRGB [3, H, W] in 0 to 1, on the CPU; all of it printable if the texels were tones of inks.
         losses: Mean of the ascended loss in each epoch.
         gradients: Maximum length of a texel's gradient in each epoch; 0 means that no gradient reaches the texture.
     """
@@ -145,7 +149,7 @@ def train_texture(
         surface: Surface that carries the texture.
         views: Images whose target wears texture 0 on that surface; with 3D truth and a camera matrix for a 3D
             detector.
-        start: Initial texture, sRGB [3, H, W].
+        start: Initial texture, sRGB [3, H, W]; with `attack.inks` the nearest printable one is.
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
         paint: Linear RGB [3] of the covered surface, for `attack.stealth`.
         appearance: Maps the colours of a texture to the albedo of its print, or to the light of a projector.
@@ -169,25 +173,29 @@ def train_texture(
     if attack.stealth > 0.0 and paint is None:
         raise ConfigError(f"attack {attack.name}: stealth is for what is printed on something, whose colour is known")
     objective = make_objective(attack.objective) if isinstance(attack.objective, str) else attack.objective
-    colour = start.detach().to(device, torch.float32).clone().requires_grad_()
+    colour_of, bounded = (ink_colour, clamp_tones) if attack.inks else (_same, _clamp_colour)
+    texels = (tones_of(start) if attack.inks else start).detach().to(device, torch.float32).clone().requires_grad_()
+    middle = torch.full_like(start[:, :1, :1], 0.5)
+    neutral = (tones_of(middle) if attack.inks else middle).to(texels)
     optimiser: torch.optim.Optimizer
     if attack.optimiser == "adam":
-        optimiser = torch.optim.Adam([colour], lr=attack.rate, eps=1e-8)
+        optimiser = torch.optim.Adam([texels], lr=attack.rate, eps=1e-8)
     else:
-        optimiser = torch.optim.SGD([colour], lr=attack.rate, momentum=0.9)
-    state = _State(colour, optimiser, np.zeros(len(views)), [], [])
+        optimiser = torch.optim.SGD([texels], lr=attack.rate, momentum=0.9)
+    state = _State(texels, optimiser, np.zeros(len(views)), [], [])
     # Without the number of epochs, so that a training can be resumed with more of them.
     training_id = digest("texture", replace(attack, epochs=1), surface.size, surface.place, len(views), key)
     if checkpoint is not None and checkpoint.is_file():
         state.load(checkpoint, training_id)
     mask = torch.as_tensor(surface.mask, device=device)
-    ink_colours = None if printable is None else printable.to(colour)
+    ink_colours = None if printable is None or attack.inks else printable.to(texels)
     with steady(detector):
         for epoch in range(len(state.losses), attack.epochs):
             order = _order(attack, state.hard, generator("texture order", *key, epoch))
             loss_sum, steepest = 0.0, 0.0
             for step, batch_start in enumerate(range(0, len(order), attack.batch)):
                 batch_indices = order[batch_start : batch_start + attack.batch]
+                colour = colour_of(texels)
                 losses = _ascended_losses(
                     attack, objective, detector, views, colour, batch_indices.tolist(), appearance, (*key, epoch, step)
                 )
@@ -198,15 +206,15 @@ def train_texture(
                     loss = loss + attack.stealth * conspicuousness(albedo_of(colour), paint.to(colour), mask) / 100.0
                 optimiser.zero_grad()
                 torch.autograd.backward(loss)
-                assert colour.grad is not None
-                if not bool(colour.grad.isfinite().all()):
+                assert texels.grad is not None
+                if not bool(texels.grad.isfinite().all()):
                     raise ConfigError(f"attack {attack.name}: the gradient is not finite in epoch {epoch + 1}")
                 if attack.decay > 0.0:
-                    colour.grad += attack.decay * (colour.detach() - 0.5)
-                steepest = max(steepest, float(colour.grad.square().sum(0).max().sqrt()))
+                    texels.grad += attack.decay * (texels.detach() - neutral)
+                steepest = max(steepest, float(texels.grad.square().sum(0).max().sqrt()))
                 optimiser.step()
                 with torch.no_grad():
-                    colour.clamp_(0.0, 1.0)
+                    texels.copy_(bounded(texels))
                 loss_sum += float(losses.detach().sum())
                 state.hard[batch_indices] = losses.detach().cpu().double().numpy()
             state.losses.append(loss_sum / len(order))
@@ -219,7 +227,19 @@ def train_texture(
             if checkpoint is not None:
                 state.save(checkpoint, training_id)
             progress(epoch + 1, attack.epochs)
-    return TextureTrainingResult(colour.detach().cpu(), state.losses, state.gradients)
+    trained_colour = colour_of(texels.detach()).cpu()
+    if attack.inks:
+        # Textures cannot show every print, and what they show of it must be printable too.
+        trained_colour = project_onto_gamut(trained_colour)
+    return TextureTrainingResult(trained_colour, state.losses, state.gradients)
+
+
+def _same(colour: Tensor) -> Tensor:
+    return colour
+
+
+def _clamp_colour(colour: Tensor) -> Tensor:
+    return colour.clamp(0.0, 1.0)
 
 
 def _ascended_losses(  # noqa: PLR0917
@@ -271,9 +291,9 @@ def _order(attack: TextureAttack, image_losses: Any, random: np.random.Generator
 
 @dataclass(slots=True)
 class _State:
-    """Everything that changes during a training."""
+    """Everything that changes during a training; texels are tones of inks, or colours."""
 
-    colour: Tensor
+    texels: Tensor
     optimiser: torch.optim.Optimizer
     hard: Any
     losses: list[float]
@@ -281,8 +301,8 @@ class _State:
 
     def save(self, path: Path, name: str) -> None:
         """Write the state in one file."""
-        optimiser_state = self.optimiser.state[self.colour]
-        arrays = {"colour": self.colour.detach().cpu().numpy(), "hard": self.hard}
+        optimiser_state = self.optimiser.state[self.texels]
+        arrays = {"texels": self.texels.detach().cpu().numpy(), "hard": self.hard}
         arrays |= {"losses": np.array(self.losses), "gradients": np.array(self.gradients)}
         for key, value in optimiser_state.items():
             arrays[f"optimiser.{key}"] = torch.as_tensor(value).cpu().numpy()
@@ -294,10 +314,10 @@ class _State:
         """Read the state from a file. FormatError: it is of another training."""
         arrays = safeio.load_npz(path)
         try:
-            if arrays["name"].tobytes().decode() != name or arrays["colour"].shape != tuple(self.colour.shape):
+            if arrays["name"].tobytes().decode() != name or arrays["texels"].shape != tuple(self.texels.shape):
                 raise FormatError(f"{path}: the checkpoint of another training; remove it, or choose another file")
             with torch.no_grad():
-                self.colour.copy_(torch.from_numpy(arrays["colour"].copy()))
+                self.texels.copy_(torch.from_numpy(arrays["texels"].copy()))
             self.hard = arrays["hard"].copy()
             self.losses = arrays["losses"].tolist()
             self.gradients = arrays["gradients"].tolist()
@@ -306,8 +326,8 @@ class _State:
                 if key.startswith("optimiser."):
                     tensor = torch.from_numpy(value.copy())
                     optimiser_state[key.removeprefix("optimiser.")] = (
-                        tensor if tensor.ndim == 0 else tensor.to(self.colour.device)
+                        tensor if tensor.ndim == 0 else tensor.to(self.texels.device)
                     )
-            self.optimiser.state[self.colour] = optimiser_state
+            self.optimiser.state[self.texels] = optimiser_state
         except KeyError as error:
             raise FormatError(f"{path}: no checkpoint of a texture ({error} is missing)") from None

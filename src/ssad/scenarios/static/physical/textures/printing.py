@@ -148,12 +148,15 @@ def conspicuousness(albedo: Tensor, paint: Tensor, mask: Tensor | None = None) -
     colours = albedo.flatten(1).T if mask is None else albedo[:, mask.bool()].T
     if not len(colours):
         return albedo.sum() * 0.0
-    lab_difference = _lab(colours) - _lab(paint.to(colours)[None])
+    lab_difference = lab_of(colours) - lab_of(paint.to(colours)[None])
     return ((lab_difference.square().sum(1) + 1e-8).sqrt() - 1e-4).mean()
 
 
-def _lab(colours: Tensor) -> Tensor:
-    """CIELAB [N, 3] of linear RGB [N, 3]."""
+def lab_of(colours: Tensor) -> Tensor:
+    """Return CIELAB [N, 3] (D65) of linear RGB [N, 3].
+
+    Source: CIE 15, Colorimetry.
+    """
     relative_xyz = colours @ colours.new_tensor(_XYZ).T / colours.new_tensor(_XYZ).sum(1)
     linear_limit = (6.0 / 29.0) ** 3
     # Clamped, since the unused branch of `where` would give an infinite gradient at 0.

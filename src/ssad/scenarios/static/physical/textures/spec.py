@@ -35,6 +35,9 @@ class TextureSpec:
         pair: Training and test data, as given in the suite.
         around: Number of additional training images from all around the target.
         file: Existing texture (see `load_texture`); None: it is trained.
+        inks: Whether controls have the nearest colours that inks can give, and trainings tones of inks; of a file,
+            whether it is projected onto the gamut of the inks.
+        approach: Whether it is trained on views at all distances of an approach.
     """
 
     attack: str
@@ -47,11 +50,16 @@ class TextureSpec:
     pair: Mapping[str, Any]
     around: int = 0
     file: str | None = None
+    inks: bool = False
+    approach: bool = False
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Self:
-        """Create a specification from plain data with these keys, among others."""
-        return cls(**{field_info.name: row[field_info.name] for field_info in fields(cls)})
+        """Create a specification from plain data with these keys, among others.
+
+        Rows of older runs do not say `inks`: their textures have any colour.
+        """
+        return cls(**{field_info.name: row[field_info.name] for field_info in fields(cls) if field_info.name in row})
 
     @property
     def trained(self) -> str:
@@ -72,18 +80,20 @@ class TextureSpec:
         """Short name of everything that the training depends on; for a file, of the file."""
         attack = self.of or self.attack
         if self.file is not None:
-            return f"{attack}-{Path(self.file).stem}"
+            return f"{attack}-{Path(self.file).stem}{'-printable' if self.inks else ''}"
         data_key = attack, self.source, self.carrier, safeio.dump_json(self.options)
         training_key = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
         # Added only if used, so that the names of textures without it stay the same.
-        optional_key = (self.around,) if self.around else ()
+        flags = tuple(name for name in ("inks", "approach") if getattr(self, name))
+        optional_key = (*((self.around,) if self.around else ()), *flags)
         return f"{attack}-{digest('texture', *data_key, *training_key, *optional_key)[:12]}"
 
     @property
     def picture(self) -> str:
         """File name of the texture as an image."""
         if self.attack in CONTROLS and not self.source:
-            return f"{self.attack}-{self.carrier}-{digest('carrier', self.surface)[:8]}-{self.number}.png"
+            suffix = "-printable" if self.inks else ""
+            return f"{self.attack}-{self.carrier}-{digest('carrier', self.surface)[:8]}-{self.number}{suffix}.png"
         return f"{self.name}{f'-shuffled-{self.number}' if self.attack == 'shuffled' else ''}.png"
 
     @property

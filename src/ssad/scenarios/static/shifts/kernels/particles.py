@@ -2,9 +2,15 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import colour, draw, unit
+from ssad.scenarios.static.shifts.kernels.light import CODES, WHITE
+from ssad.scenarios.static.shifts.kernels.shared import draw, unit
 
 wp.set_module_options({"enable_backward": False})  # see `exposure`
+
+BLOCK = wp.constant(16)  # px, side of the squares that drops on the lens show
+SOFT_EDGE = wp.constant(0.45)  # share of a drop's radius over which it fades
+LIGHT_PARTS = wp.constant(float(CODES))
+HIGHEST_CODE = wp.constant(int(CODES - 1))
 
 
 @wp.struct
@@ -46,6 +52,8 @@ class LensDrop:
         y: Centre, pixels.
         radius: Pixels.
         oval: Height over width.
+        oval_phase: Direction of the first uneven part of its outline, rad.
+        bump_phase: Direction of the second, rad.
     """
 
     image: int
@@ -53,18 +61,73 @@ class LensDrop:
     y: float
     radius: float
     oval: float
+    oval_phase: float
+    bump_phase: float
+
+
+@wp.kernel
+def blur_coarsely(
+    image: wp.array(dtype=wp.uint8),
+    linear: wp.array(dtype=int),
+    height: int,
+    width: int,
+    out: wp.array3d(dtype=wp.vec3),
+):
+    """Compute the mean light (1 for white) of squares of BLOCK pixels, from every second pixel of every second row.
+
+    They are those of a quincunx, which meets both fields of a fine chequered pattern.
+    """
+    b, row = wp.tid()
+    for column in range(out.shape[2]):
+        total = wp.vec3(0.0, 0.0, 0.0)
+        count = float(0.0)
+        for dy in range(0, BLOCK, 2):
+            y = row * BLOCK + dy
+            if y < height:
+                for dx in range(0, BLOCK, 2):
+                    x = column * BLOCK + dx + (dy / 2) % 2
+                    if x < width:
+                        pixel = ((b * height + y) * width + x) * 3
+                        total += wp.vec3(
+                            float(linear[int(image[pixel])]),
+                            float(linear[int(image[pixel + 1])]),
+                            float(linear[int(image[pixel + 2])]),
+                        )
+                        count += 1.0
+        out[b, row, column] = total / (count * WHITE)
+
+
+@wp.func
+def coarse_light(coarse: wp.array3d(dtype=wp.vec3), b: int, y: float, x: float) -> wp.vec3:
+    """Return the light at a place of the image, px, between four squares, clamped at the border."""
+    grid_y = wp.clamp(y / float(BLOCK) - 0.5, 0.0, float(coarse.shape[1] - 1))
+    grid_x = wp.clamp(x / float(BLOCK) - 0.5, 0.0, float(coarse.shape[2] - 1))
+    row = wp.min(int(grid_y), wp.max(coarse.shape[1] - 2, 0))
+    column = wp.min(int(grid_x), wp.max(coarse.shape[2] - 2, 0))
+    next_row = wp.min(row + 1, coarse.shape[1] - 1)
+    next_column = wp.min(column + 1, coarse.shape[2] - 1)
+    lower_share = grid_y - float(row)
+    right_share = grid_x - float(column)
+    upper = coarse[b, row, column] * (1.0 - right_share) + coarse[b, row, next_column] * right_share
+    lower = coarse[b, next_row, column] * (1.0 - right_share) + coarse[b, next_row, next_column] * right_share
+    return upper * (1.0 - lower_share) + lower * lower_share
 
 
 @wp.kernel
 def refract(
-    image: wp.array(dtype=wp.uint8),
+    coarse: wp.array3d(dtype=wp.vec3),
     drops: wp.array(dtype=LensDrop),
     first: wp.array(dtype=int),
+    linear: wp.array(dtype=int),
+    codes: wp.array(dtype=wp.uint8),
     height: int,
     width: int,
     out: wp.array(dtype=wp.uint8),
 ):
     """Draw drops as small lenses out of focus: the surroundings upside down, reduced and blurred, dark at the rim.
+
+    The surroundings come from an image of coarse squares, as a drop spans many pixels of the scene with each of its
+    own; light mixes as light, and the edge is as soft as a thing so near to the lens is.
 
     One thread per row, the drops of an image one after the other, so that the order of overlapping drops is fixed.
     """
@@ -72,29 +135,40 @@ def refract(
     image_start = b * height * width * 3
     for drop_index in range(first[b], first[b + 1]):
         drop = drops[drop_index]
-        v = float(y - int(drop.y)) / (drop.radius * drop.oval)
-        if wp.abs(v) < 1.0:
-            half_width = int(drop.radius) + 1
+        share_y = (float(y) - drop.y) / (drop.radius * drop.oval)
+        if wp.abs(share_y) < 1.25:
+            half_width = int(1.25 * drop.radius) + 1
             for column_offset in range(-half_width, half_width + 1):
                 x = int(drop.x) + column_offset
-                u = float(column_offset) / drop.radius
-                radius_share = wp.sqrt(u * u + v * v)
+                share_x = (float(x) - drop.x) / drop.radius
+                angle = wp.atan2(share_y, share_x)
+                uneven = (
+                    1.0 + 0.12 * wp.cos(2.0 * angle + drop.oval_phase) + 0.06 * wp.cos(3.0 * angle + drop.bump_phase)
+                )
+                radius_share = wp.sqrt(share_x * share_x + share_y * share_y) / uneven
                 if radius_share < 1.0 and x >= 0 and x < width:
-                    total = wp.vec3i(0, 0, 0)
+                    # A wide view that bulges: its rim looks farther aside than its middle, past the image border.
+                    bulge = (0.35 + 0.2 * radius_share * radius_share) * float(height)
+                    light = wp.vec3(0.0, 0.0, 0.0)
                     for tap_index in range(9):
-                        # a wide view: the rim looks past the image border, where it is clamped
-                        source_x = drop.x - (u + float(tap_index % 3 - 1) * 0.12) * float(height) * 0.55
-                        source_y = drop.y - (v + float(tap_index / 3 - 1) * 0.12) * float(height) * 0.55
-                        row = wp.clamp(int(source_y), 0, height - 1)
-                        total += colour(image, image_start + (row * width + wp.clamp(int(source_x), 0, width - 1)) * 3)
-                    opacity = 0.8 * wp.clamp((1.0 - radius_share) * 3.0, 0.0, 1.0)
-                    gain = (1.0 - 0.35 * radius_share * radius_share) * opacity / 9.0
-                    target_byte = image_start + (y * width + x) * 3
-                    for tap_index in range(3):
-                        light = (
-                            float(out[target_byte + tap_index]) * (1.0 - opacity) + float(total[tap_index]) * gain + 0.5
+                        tap_x = float(tap_index % 3 - 1)
+                        tap_y = float(tap_index / 3 - 1)
+                        # Binomial weights over 3 x 3 places, as far apart as the squares are.
+                        weight = (2.0 - wp.abs(tap_x)) * (2.0 - wp.abs(tap_y)) / 16.0
+                        light += weight * coarse_light(
+                            coarse,
+                            b,
+                            drop.y - share_y * bulge + tap_y * float(BLOCK),
+                            drop.x - share_x * bulge + tap_x * float(BLOCK),
                         )
-                        out[target_byte + tap_index] = wp.uint8(wp.min(light, 255.0))
+                    edge = wp.clamp((1.0 - radius_share) / SOFT_EDGE, 0.0, 1.0)
+                    opacity = 0.85 * edge * edge * (3.0 - 2.0 * edge)
+                    gain = (1.0 - 0.45 * radius_share * radius_share) * opacity
+                    target_byte = image_start + (y * width + x) * 3
+                    for channel in range(3):
+                        behind = float(linear[int(out[target_byte + channel])]) / WHITE
+                        mixed = behind * (1.0 - opacity) + light[channel] * gain
+                        out[target_byte + channel] = codes[wp.clamp(int(mixed * LIGHT_PARTS), 0, HIGHEST_CODE)]
 
 
 @wp.func
@@ -108,6 +182,33 @@ def deposit(layer: wp.array3d(dtype=int), b: int, y: int, x: int, amount: float)
     """Add opacity (of 65536) to a cell; integer sums do not depend on the order of the particles."""
     if y >= 0 and y < layer.shape[1] and x >= 0 and x < layer.shape[2]:
         wp.atomic_add(layer, b, y, x, int(amount * 65536.0))
+
+
+@wp.func
+def soft_disc(distance: float, radius: float, soft: float) -> float:
+    """Return the cover of a disc at a distance from its middle; its edge fades over `soft`."""
+    return wp.clamp((radius - distance) / soft + 0.5, 0.0, 1.0)
+
+
+@wp.func
+def streak_cover(along: float, across: float, length: float, radius: float, soft: float) -> float:
+    """Return the share of the exposure for which a soft disc that moves along a line covers a point.
+
+    along, across: the point from the start of the line; the cover is the mean over discs along the line.
+    """
+    if wp.abs(across) >= radius + 0.5 * soft:
+        return 0.0
+    if length < 0.25:
+        return soft_disc(wp.sqrt(along * along + across * across), radius, soft)
+    total = float(0.0)
+    # A soft disc is the mean of discs whose radii differ by its edge; the chord of each covers the point in turn.
+    for layer_index in range(4):
+        disc_radius = radius + soft * ((float(layer_index) + 0.5) * 0.25 - 0.5)
+        squared = disc_radius * disc_radius - across * across
+        if disc_radius > 0.0 and squared > 0.0:
+            chord = wp.sqrt(squared)
+            total += wp.max(wp.min(along + chord, length) - wp.max(along - chord, 0.0), 0.0)
+    return 0.25 * total / length
 
 
 @wp.kernel
@@ -193,52 +294,41 @@ def splat(
         return
     dx = end_x - start_x
     dy = end_y - start_y
-    streak_length = wp.sqrt(dx * dx + dy * dy)
-    opacity = wp.min(fade * 0.785 * size * size / (diameter * (streak_length + 0.785 * diameter)), 0.95)
-    radius = diameter * 0.5
-    if streak_length < 1.0:
-        # a disc
-        centre_x = 0.5 * (start_x + end_x)
-        centre_y = 0.5 * (start_y + end_y)
-        disc_reach = int(radius + 1.0)
-        x0 = int(wp.floor(centre_x + 0.5))
-        y0 = int(wp.floor(centre_y + 0.5))
-        for row_offset in range(-disc_reach, disc_reach + 1):
-            for column_offset in range(-disc_reach, disc_reach + 1):
-                offset_x = float(x0 + column_offset) - centre_x
-                offset_y = float(y0 + row_offset) - centre_y
-                coverage = wp.clamp(radius + 0.5 - wp.sqrt(offset_x * offset_x + offset_y * offset_y), 0.0, 1.0)
-                if coverage > 0.0:
-                    deposit(layer, b, y0 + row_offset, x0 + column_offset, opacity * coverage)
-    elif wp.abs(dy) >= wp.abs(dx):
-        slope = dx / dy
-        half_thickness = radius * wp.sqrt(1.0 + slope * slope)
-        low = wp.max(wp.min(start_y, end_y) - radius, 0.0)
-        high = wp.min(wp.max(start_y, end_y) + radius, rows - 1.0)
-        for y in range(int(low), int(high) + 1):
-            line_centre = start_x + (float(y) - start_y) * slope
-            end_fade = wp.clamp(
-                wp.min(float(y) - wp.min(start_y, end_y), wp.max(start_y, end_y) - float(y)) + 0.5 + radius, 0.0, 1.0
+    length = wp.sqrt(dx * dx + dy * dy)
+    # A disc that moves along a line: each cell is covered for as long as the disc holds it. Its edge is as wide as the
+    # smaller of the particle and its blur, since one spreads the other.
+    soft = wp.clamp(wp.min(size, blur), 1.0, diameter)
+    radius = 0.5 * diameter
+    reach = radius + 0.5 * soft
+    opacity = wp.min(fade * size * size / (diameter * diameter), 0.95)
+    axis_x = float(1.0)
+    axis_y = float(0.0)
+    if length > 1.0e-3:
+        axis_x = dx / length
+        axis_y = dy / length
+    is_steep = wp.abs(axis_y) >= wp.abs(axis_x)
+    # Cells are visited along the longer axis of the streak, and across it around its line.
+    start_major = wp.where(is_steep, start_y, start_x)
+    end_major = wp.where(is_steep, end_y, end_x)
+    start_minor = wp.where(is_steep, start_x, start_y)
+    along = wp.where(is_steep, axis_y, axis_x)
+    aside = wp.where(is_steep, axis_x, axis_y)
+    slope = aside / along
+    half_thickness = reach / wp.abs(along)
+    low = wp.max(wp.min(start_major, end_major) - reach, 0.0)
+    high = wp.min(wp.max(start_major, end_major) + reach, wp.where(is_steep, rows, columns) - 1.0)
+    minor_cells = wp.where(is_steep, columns, rows)
+    for major in range(int(low), int(wp.ceil(high)) + 1):
+        line_centre = start_minor + (float(major) - start_major) * slope
+        first_minor = int(wp.max(wp.floor(line_centre - half_thickness), 0.0))
+        last_minor = int(wp.min(wp.ceil(line_centre + half_thickness), minor_cells - 1.0))
+        for minor in range(first_minor, last_minor + 1):
+            y = wp.where(is_steep, major, minor)
+            x = wp.where(is_steep, minor, major)
+            offset_x = float(x) - start_x
+            offset_y = float(y) - start_y
+            covered = streak_cover(
+                offset_x * axis_x + offset_y * axis_y, offset_y * axis_x - offset_x * axis_y, length, radius, soft
             )
-            for x in range(
-                int(wp.floor(line_centre - half_thickness)), int(wp.floor(line_centre + half_thickness)) + 2
-            ):
-                coverage = wp.clamp(half_thickness + 0.5 - wp.abs(float(x) - line_centre), 0.0, 1.0) * end_fade
-                if coverage > 0.0:
-                    deposit(layer, b, y, x, opacity * coverage)
-    else:
-        slope = dy / dx
-        half_thickness = radius * wp.sqrt(1.0 + slope * slope)
-        low = wp.max(wp.min(start_x, end_x) - radius, 0.0)
-        high = wp.min(wp.max(start_x, end_x) + radius, columns - 1.0)
-        for x in range(int(low), int(high) + 1):
-            line_centre = start_y + (float(x) - start_x) * slope
-            end_fade = wp.clamp(
-                wp.min(float(x) - wp.min(start_x, end_x), wp.max(start_x, end_x) - float(x)) + 0.5 + radius, 0.0, 1.0
-            )
-            for y in range(
-                int(wp.floor(line_centre - half_thickness)), int(wp.floor(line_centre + half_thickness)) + 2
-            ):
-                coverage = wp.clamp(half_thickness + 0.5 - wp.abs(float(y) - line_centre), 0.0, 1.0) * end_fade
-                if coverage > 0.0:
-                    deposit(layer, b, y, x, opacity * coverage)
+            if covered > 0.0:
+                deposit(layer, b, y, x, opacity * covered)

@@ -278,6 +278,29 @@ def mirror(
         out[b, y, x] = result
 
 
+@wp.kernel
+def soften(shine: wp.array3d(dtype=wp.vec4), ground: wp.array3d(dtype=float), out: wp.array3d(dtype=wp.vec4)):
+    """Blur the reflection over 3 x 5 cells of ground, as waves do, so that its outlines have no steps of a cell."""
+    b, y = wp.tid()
+    for x in range(shine.shape[2]):
+        total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        weight = float(0.0)
+        if ground[b, y, x] > 0.0:
+            for row_offset in range(-2, 3):
+                row = y + row_offset
+                if row >= 0 and row < shine.shape[1]:
+                    for column_offset in range(-1, 2):
+                        column = x + column_offset
+                        if column >= 0 and column < shine.shape[2]:
+                            # Binomial weights; what is no ground reflects nothing and has none.
+                            share = ground[b, row, column] * (2.0 - wp.abs(float(column_offset)))
+                            share *= 3.0 - wp.abs(float(row_offset))
+                            total += shine[b, row, column] * share
+                            weight += share
+            total = total / wp.max(weight, 1.0e-6)
+        out[b, y, x] = total
+
+
 @wp.func
 def between(grid: wp.array3d(dtype=Any), b: int, row: int, fraction: float, column: int):
     """Return the value of a grid, of numbers or vectors, between two of its rows; columns are clamped."""

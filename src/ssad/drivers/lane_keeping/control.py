@@ -1,0 +1,99 @@
+"""Speed and steering of the lane keeper: pure pursuit of the lane, and distance to what drives in it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from ssad.core.driving import Belief, Observation
+from ssad.core.perception import PerceivedLane
+from ssad.core.types import F64, AgentKind, SignalState
+
+PREVIEW: Final = (4.0, 0.45)  # m, s: the pursued point lies so far ahead, plus the way of so much time
+LATERAL: Final = 2.5  # m/s^2, lateral acceleration in bends
+PULL: Final = 1.5  # m/s^2, highest acceleration
+COMFORT: Final = 2.0  # m/s^2, comfortable braking
+HARDEST: Final = 8.0  # m/s^2, braking for an obstacle
+HEADWAY: Final = 1.5  # s to the vehicle in front
+STANDSTILL: Final = 3.0  # m to the vehicle in front at rest
+RESPONSE: Final = 0.8  # s, time constant with which the speed follows
+PATH: Final = 0.3  # m between the body of the ego and what does not lie in its path
+REACH: Final = 80.0  # m ahead
+
+
+def pursuit_curvature(lane: PerceivedLane, speed: float) -> float:
+    """Return the curvature of the circle through a point of the lane's middle ahead, 1/m, positive to the left.
+
+    Pure pursuit (Coulter, CMU-RI-TR-92-01, 1992). On a circular lane it is the curvature of the lane.
+    """
+    ahead = PREVIEW[0] + PREVIEW[1] * max(speed, 0.0)
+    lateral = lane.middle(ahead)
+    return 2.0 * lateral / (ahead * ahead + lateral * lateral)
+
+
+def steer_for(curvature: float, wheelbase: float, lock: float) -> float:
+    """Return the steering, -1 to 1, with which the centre of a body drives along a curvature.
+
+    Args:
+        curvature: 1/m, positive to the left.
+        wheelbase: m.
+        lock: Angle of the front wheels at full lock, rad.
+    """
+    # The kinematic bicycle about the middle of its wheelbase: sin(slip) = curvature x wheelbase / 2.
+    slip_sine = float(np.clip(0.5 * curvature * wheelbase, -0.9, 0.9))
+    wheel_angle = np.arctan(2.0 * slip_sine / np.sqrt(1.0 - slip_sine * slip_sine))
+    return float(np.clip(wheel_angle / lock, -1.0, 1.0))
+
+
+def bend_speed(lane: PerceivedLane) -> float:
+    """Return the speed at which the bend of a lane takes `LATERAL`, m/s."""
+    return float(np.sqrt(LATERAL / max(abs(lane.curvature), 1e-4)))
+
+
+def following_acceleration(view: Observation, belief: Belief, row: int, lane: PerceivedLane, size: F64) -> float:
+    """Return the acceleration that keeps the distance to the nearest believed object in the lane, m/s^2.
+
+    That of the Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000), without its term for the free road.
+
+    Args:
+        view: Observation.
+        belief: Believed objects.
+        row: Row of both.
+        lane: The lane that the ego keeps.
+        size: Length and width of the ego, m.
+
+    Returns:
+        inf where nothing is in the lane.
+    """
+    is_object = belief.kind[row] != AgentKind.NONE
+    pose = belief.pose[row][is_object].astype(np.float64)
+    x, y, yaw = view.pose[row].astype(np.float64).tolist()
+    offset = pose[:, :2] - [x, y]
+    ahead = offset[:, 0] * np.cos(yaw) + offset[:, 1] * np.sin(yaw)
+    lateral = offset[:, 1] * np.cos(yaw) - offset[:, 0] * np.sin(yaw)
+    length, width = belief.size[row][is_object].astype(np.float64).T
+    turn = pose[:, 2] - yaw
+    half_length = 0.5 * (length * np.abs(np.cos(turn)) + width * np.abs(np.sin(turn)))
+    half_width = 0.5 * (length * np.abs(np.sin(turn)) + width * np.abs(np.cos(turn)))
+    middle = lane.offset + lane.heading * ahead + 0.5 * lane.curvature * ahead**2
+    in_path = (ahead > 0.0) & (ahead < REACH) & (np.abs(lateral - middle) < half_width + 0.5 * size[1] + PATH)
+    if not in_path.any():
+        return float("inf")
+    gap = np.maximum((ahead - half_length)[in_path] - 0.5 * size[0], 0.1)
+    speed = float(view.speed[row])
+    closing = speed - belief.speed[row][is_object].astype(np.float64)[in_path] * np.cos(turn[in_path])
+    desired = STANDSTILL + np.maximum(speed * HEADWAY + speed * closing / (2.0 * np.sqrt(PULL * COMFORT)), 0.0)
+    return float((PULL * (1.0 - (desired / gap) ** 2)).min())
+
+
+def line_acceleration(view: Observation, row: int, half_length: float) -> float:
+    """Return the acceleration that stops at the line of a red light, m/s^2; inf where none is due."""
+    state, distance = view.signal[row].astype(np.float64).tolist()
+    room = distance - half_length - 1.0
+    if state not in (SignalState.RED, SignalState.YELLOW) or not -2.0 < room < REACH:
+        return float("inf")
+    required = float(view.speed[row]) ** 2 / (2.0 * max(room, 0.3))
+    if state == SignalState.YELLOW and required > COMFORT:
+        return float("inf")
+    return -max(required, COMFORT) if required > 0.5 * COMFORT or room < 2.0 else float("inf")

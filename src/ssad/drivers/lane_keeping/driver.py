@@ -1,0 +1,167 @@
+"""The lane keeper: it steers by the lane markings that it detects in its camera, and keeps distance.
+
+    camera -> road seen from above -> markings -> lane filter -> pure pursuit -> steering
+    perceiver -> tracker -> belief -> distance -> throttle and brake
+
+Other road users are perceived as by every perceiving driver. The map does not steer: where no markings are in view the
+lane keeper holds the last lane by its own motion, and after a while it slows down and stops, as systems do that hand
+over to a driver who does not take over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, Final
+
+import numpy as np
+
+from ssad.core.driving import Observation
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.perception import PerceivedLane
+from ssad.core.types import F32, F64, U8, Controller, Episode
+from ssad.drivers.lane_keeping.control import (
+    COMFORT,
+    HARDEST,
+    PULL,
+    RESPONSE,
+    bend_speed,
+    following_acceleration,
+    line_acceleration,
+    pursuit_curvature,
+    steer_for,
+)
+from ssad.drivers.lane_keeping.lane import LaneFilter
+from ssad.drivers.lane_keeping.markings import RoadMap, TopView, marking_strength
+from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
+from ssad.drivers.perceiving.parts import Perceiver
+from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_cameras
+from ssad.world.models import agent_model
+
+CHANNEL: Final = "CAM_FRONT"
+SURE: Final = 0.5  # confidence from which on markings count as detected
+PATIENCE: Final = 1.5  # s without markings before it slows down
+
+
+class _Scene:
+    """Memory of one episode."""
+
+    def __init__(self, grid: TopView, size: F64, power: F64, wheel: F64) -> None:
+        self.filter = LaneFilter(grid)
+        self.size, self.power, self.wheel = size, power, wheel
+        self.pose: F64 | None = None
+        self.time = 0.0
+        self.lost_since: float | None = None
+        self.lane: PerceivedLane | None = None
+
+
+class LaneKeeper(PerceivingDriver):
+    """Lane keeper with one front camera.
+
+    Args:
+        perceiver: Source of detections of other road users; None: a perfect detector.
+        camera: Camera of the lane markings; None: the front camera of the nuScenes rig, 640 px wide.
+        grid: Top view in which markings are detected; None: the usual one.
+        **settings: Further arguments of `PerceivingDriver`.
+
+    Raises:
+        ConfigError: A planner is given: the lane keeper plans itself.
+    """
+
+    name = "lane-keeper"
+
+    def __init__(
+        self,
+        perceiver: Perceiver | None = None,
+        *,
+        camera: Camera | None = None,
+        grid: TopView | None = None,
+        **settings: Any,
+    ) -> None:
+        if settings.get("planner") is not None:
+            raise ConfigError("a lane keeper plans itself; leave out the planner")
+        super().__init__(perceiver or PerfectPerceiver(), **settings)
+        self.controller = Controller.EXTERNAL
+        self.__dict__.pop("believe", None)  # the Autopilot does not plan for it
+        self.lane_camera = camera or nuscenes_cameras()[CHANNEL]
+        self.road_map = RoadMap(self.lane_camera, grid or TopView())
+        self.sensors = tuple(dict.fromkeys((*self.sensors, CHANNEL)))
+        self._scenes: list[_Scene] = []
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """Cameras among its sensors, which the engine renders."""
+        return {**super().cameras, CHANNEL: self.lane_camera}
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Forget the past."""
+        super().reset(episodes)
+        bodies = [agent_model(episode.agents[0]) for episode in episodes]
+        self._scenes = [
+            _Scene(
+                self.road_map.grid,
+                np.array([body.length, body.width]),
+                np.array([body.max_accel, body.max_brake]),
+                np.array([body.wheelbase, body.max_steer]),
+            )
+            for body in bodies
+        ]
+
+    def snapshot_batch(self) -> Any:
+        """Return the state of the whole batch, see `PerceivingDriver.snapshot_batch`."""
+        return super().snapshot_batch(), deepcopy(self._scenes)
+
+    def restore_batch(self, snapshot: Any) -> None:
+        """Continue from an earlier snapshot of the same batch."""
+        perceiving, scenes = snapshot
+        super().restore_batch(perceiving)
+        self._scenes = deepcopy(scenes)
+
+    def act(self, view: Observation) -> F32:
+        """Return the controls [N, 3]."""
+        belief = self._perceived_belief(view)
+        images = view.readings[CHANNEL]
+        controls = np.zeros((len(view.scene), 3), np.float32)
+        for row in np.flatnonzero(~view.done).tolist():
+            scene = self._scenes[int(view.scene[row])]
+            lane = self._lane(scene, view, row, images[row])
+            acceleration, steer = self._cruise(scene, view, row, lane)
+            if lane is not None:
+                following = following_acceleration(view, belief, row, lane, scene.size)
+                acceleration = max(min(acceleration, following), -HARDEST)
+            throttle, brake = acceleration / scene.power[0], -acceleration / scene.power[1]
+            controls[row] = np.clip([throttle, brake, steer], [0.0, 0.0, -1.0], 1.0)
+        return controls
+
+    def _lane(self, scene: _Scene, view: Observation, row: int, image: Any) -> PerceivedLane | None:
+        """Return the lane at the present time, from the image if it is not lost."""
+        pose, time = view.pose[row].astype(np.float64), float(view.time[row])
+        if scene.pose is not None:
+            forward = float(np.hypot(*(pose[:2] - scene.pose[:2])))
+            turn = float(np.angle(np.exp(1j * (pose[2] - scene.pose[2]))))
+            scene.filter.predict(forward, turn, time - scene.time)
+        scene.pose, scene.time = pose, time
+        pixels: U8 = image.cpu().numpy() if hasattr(image, "cpu") else np.asarray(image)
+        lane = scene.filter.held()
+        if pixels.any():  # an image of zeros is a loss of signal
+            grid = self.road_map.grid
+            lane = scene.filter.correct(marking_strength(self.road_map.brightness(pixels), grid))
+        is_lost = lane is None or lane.confidence < SURE
+        scene.lost_since = None if not is_lost else scene.lost_since if scene.lost_since is not None else time
+        if self.watch is not None:
+            self.watch(LaneEvent(int(view.scene[row]), time, lane, pixels))
+        return lane
+
+    def _cruise(self, scene: _Scene, view: Observation, row: int, lane: PerceivedLane | None) -> tuple[float, float]:
+        """Return the acceleration on a free road, m/s^2, and the steering."""
+        speed = float(view.speed[row])
+        if lane is None:
+            return -COMFORT, 0.0
+        target = min(float(view.target_speed[row]), bend_speed(lane))
+        acceleration = float(np.clip((target - speed) / RESPONSE, -COMFORT, PULL))
+        if scene.lost_since is not None and scene.time - scene.lost_since > PATIENCE:
+            acceleration = -COMFORT
+        acceleration = min(acceleration, line_acceleration(view, row, 0.5 * float(scene.size[0])))
+        wheelbase, lock = scene.wheel.tolist()
+        return acceleration, steer_for(pursuit_curvature(lane, speed), wheelbase, lock)

@@ -1,0 +1,157 @@
+"""Metrics of lane keeping: deviation from the middle of the lane, departures from it, and errors of the camera's lane.
+
+The lane is that of the route: for drives that change lanes these metrics mean nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.perception import PerceivedLane
+from ssad.core.rotations import wrap_angle
+from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
+
+SURE: Final = 0.5  # confidence from which on a lane counts as detected
+
+
+@dataclass(frozen=True, eq=False)
+class LanePosition:
+    """Position of the ego in its lane at each of T steps.
+
+    Attributes:
+        deviation: [T] m to the left of the middle of the lane.
+        heading: [T] rad to the left of its direction.
+        along: [T] distance along the route, m.
+        width: [T] width of the lane, m.
+    """
+
+    deviation: F64
+    heading: F64
+    along: F64
+    width: F64
+
+
+def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> LanePosition:
+    """Return the position of the ego in the lane of its route.
+
+    Args:
+        trace: The drive.
+        graph: Its town.
+    """
+    route = trace.route.astype(np.float64)
+    steps = np.diff(route, axis=0)
+    lengths = np.hypot(*steps.T)
+    is_segment = lengths > 1e-6
+    starts, steps, lengths = route[:-1][is_segment], steps[is_segment], lengths[is_segment]
+    arc = np.concatenate([[0.0], np.cumsum(lengths)])[:-1]
+    directions = steps / lengths[:, None]
+    place = np.stack([trace.x[:, 0], trace.y[:, 0]], 1).astype(np.float64)
+    offset = place[:, None] - starts[None]
+    along = np.clip((offset * directions).sum(-1), 0.0, lengths)
+    nearest = np.hypot(*np.moveaxis(offset - along[..., None] * directions, -1, 0)).argmin(1)
+    rows = np.arange(len(place))
+    chosen = offset[rows, nearest]
+    direction = directions[nearest]
+    deviation = direction[:, 0] * chosen[:, 1] - direction[:, 1] * chosen[:, 0]
+    yaw = np.arctan2(direction[:, 1], direction[:, 0])
+    heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - yaw))
+    return LanePosition(deviation, heading, arc[nearest] + along[rows, nearest], _widths(graph, starts)[nearest])
+
+
+def _widths(graph: LaneGraph, points: F64) -> F64:
+    """Return the width of the driving lane at each of some points of a route [N], m."""
+    is_driving = np.repeat(graph.kind == LaneType.DRIVING, np.diff(graph.offset))
+    lane_points, widths = graph.xy[is_driving].astype(np.float64), graph.width[is_driving].astype(np.float64)
+    is_near = np.hypot(*(lane_points - points.mean(0)).T) < np.hypot(*(points - points.mean(0)).T).max() + 20.0
+    lane_points, widths = lane_points[is_near], widths[is_near]
+    nearest = [int(np.square(lane_points - point).sum(1).argmin()) for point in points]
+    return widths[nearest]
+
+
+def is_outside(position: LanePosition, length: float, width: float) -> Bool:
+    """Return the steps [T] in which the ego's body reaches over a line of its lane.
+
+    Args:
+        position: Position in the lane.
+        length: Length of the ego, m.
+        width: Width of the ego, m.
+    """
+    half = 0.5 * (width * np.abs(np.cos(position.heading)) + length * np.abs(np.sin(position.heading)))
+    return np.asarray(np.abs(position.deviation) + half > 0.5 * position.width)
+
+
+def lane_metrics(
+    trace: EpisodeTrace,
+    graph: LaneGraph,
+    lanes: Sequence[tuple[float, PerceivedLane | None]],
+    *,
+    place: float | None = None,
+    view: float = 0.0,
+) -> dict[str, float]:
+    """Return the metrics of lane keeping of a drive.
+
+    Args:
+        trace: The drive.
+        graph: Its town.
+        lanes: Time, s, and the lane that the driver believed in, of its steps.
+        place: Distance along the route of what may lead it astray, m; None: nothing does.
+        view: m before that place from which on the driver has it in view.
+
+    Returns:
+        lane_deviation: Mean distance to the middle of the lane, m.
+        lane_deviation_max: Greatest distance, m.
+        lane_departure: 1 if the body crosses a line of the lane, else 0.
+        departure_time: s from the moment when the place comes into view to the first crossing after it; NaN: none.
+        lane_error: Mean error of the believed middle of the lane beside the ego, m; NaN: it never believed in one.
+        lane_seen: Share of the steps in which it detected the lane.
+    """
+    position = lane_position(trace, graph)
+    outside = is_outside(position, float(trace.length[0]), float(trace.width[0]))
+    start = 0 if place is None else int((position.along >= place - view).argmax())
+    crossings = np.flatnonzero(outside[start:])
+    metrics = {
+        "lane_deviation": float(np.abs(position.deviation).mean()),
+        "lane_deviation_max": float(np.abs(position.deviation[start:]).max()),
+        "lane_departure": float(len(crossings) > 0),
+        "departure_time": float(crossings[0]) * trace.dt if len(crossings) else float("nan"),
+    }
+    errors, sure_count = [], 0
+    for time, lane in lanes:
+        step = min(round(time / trace.dt), len(position.deviation) - 1)
+        if lane is not None:
+            # The middle of the lane lies as far to the right as the ego lies to the left of it.
+            errors.append(abs(lane.offset * np.cos(position.heading[step]) + position.deviation[step]))
+            sure_count += lane.confidence >= SURE
+    metrics["lane_error"] = float(np.mean(errors)) if errors else float("nan")
+    metrics["lane_seen"] = sure_count / max(len(lanes), 1)
+    return metrics
+
+
+def lane_course(trace: EpisodeTrace, graph: LaneGraph, *, spacing: float = 2.0) -> dict[str, list[float]]:
+    """Return the deviation from the middle of the lane along a drive, for figures.
+
+    Args:
+        trace: The drive.
+        graph: Its town.
+        spacing: m of the route from one value to the next.
+
+    Returns:
+        along: Distance along the route, m.
+        deviation: m to the left of the middle of the lane, there.
+        margin: Distance of the body from each line in the middle of the lane, m, there.
+    """
+    position = lane_position(trace, graph)
+    furthest = np.maximum.accumulate(position.along)
+    along = np.arange(furthest[0], furthest[-1] + 1e-9, spacing)
+    steps = np.searchsorted(furthest, along).clip(0, len(furthest) - 1)
+    margin = 0.5 * (position.width[steps] - float(trace.width[0]))
+    return {
+        "along": [round(float(value), 2) for value in along],
+        "deviation": [round(float(value), 3) for value in position.deviation[steps]],
+        "margin": [round(float(value), 3) for value in margin],
+    }

@@ -1,0 +1,232 @@
+"""Glare of a lens: the share of light that it scatters, and the ghosts that reflections between its surfaces make.
+
+A point of light is surrounded by a veil that falls with the angle t (degrees) as 10 / t^3 + 5 / t^2, for each lux at
+the lens: the disability glare of the eye of a young person (CIE 146:2002, valid from 0.1 degrees), times the glare of
+the sensor. As a power law is a mixture of Gaussians of all widths, a / (t^2 + c^2)^(n/2) is the integral of Gaussians
+of standard deviation s, weighted by a k s^(2-n) exp(-c^2 / 2 s^2) over log s, with k = 4 pi / (2^(n/2) Gamma(n/2)).
+The levels of a pyramid of images, halved and enlarged again with tent filters, are such Gaussians, an octave apart.
+
+Each level conserves light exactly, also at borders: enlarging after halving is a symmetric matrix whose rows add up
+to 1. What a lens scatters out of the image and into it is thereby the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import warp as wp
+
+from ssad.core.types import F64
+from ssad.rendering.camera.kernels import glare as kernels
+from ssad.rendering.camera.sensor import SMALLEST, SensorModel
+
+if TYPE_CHECKING:
+    from ssad.rendering.camera.render import View
+
+CORE: Final = 0.1  # degrees within which the veil does not rise further
+VEIL: Final = ((10.0, 3.0), (5.0, 2.0))  # factor and exponent of the terms of the veil
+REFLECTION: Final = 0.005  # share of the light that a coated surface of a lens reflects
+# size over that of the image (negative: upside down), and tint by the coatings
+GHOSTS: Final = (
+    (-0.45, (0.75, 1.0, 0.70)),
+    (-1.0, (1.0, 0.80, 0.95)),
+    (0.35, (0.70, 0.85, 1.0)),
+    (-1.7, (1.0, 0.90, 0.60)),
+)
+GHOST_LEVEL: Final = 2  # level of the pyramid to which ghosts are added
+BLOOM: Final = 0.15  # glare of the effect `bloom`: a clean lens behind a clean windscreen
+FLARE: Final = 1.0  # flare of the effect `flare`
+SUN_RADIUS: Final = math.radians(0.2666)  # rad
+
+
+def with_lens_effects(sensor: SensorModel, effects: Collection[str]) -> SensorModel:
+    """Return a sensor with the glare and flare of the effects `bloom` and `flare`, unless it has its own.
+
+    Args:
+        sensor: The sensor.
+        effects: Names of effects, see `ssad.rendering.camera.effects`.
+    """
+    return replace(
+        sensor,
+        glare=sensor.glare or BLOOM * ("bloom" in effects),
+        flare=sensor.flare or FLARE * ("flare" in effects),
+    )
+
+
+@lru_cache(maxsize=64)
+def halving_weights(size: int) -> F64:
+    """Return the weights of halving an axis, without regard to earlier halvings: the transpose of enlarging.
+
+    Args:
+        size: Pixels.
+
+    Returns:
+        [ceil(size / 2), 4], of the pixels 2 i - 1 to 2 i + 2; 0 outside the axis.
+    """
+    half = (size + 1) // 2
+    weights = np.tile([0.25, 0.75, 0.75, 0.25], (half, 1))
+    # Enlarging repeats the outermost pixel, so it takes part with the whole weight of the pixel next to the border.
+    weights[0, :2] = 0.0, 1.0
+    if size % 2:
+        weights[-1, 2:] = 0.0
+    else:
+        weights[-1, 2:] = 1.0, 0.0
+    return weights
+
+
+@lru_cache(maxsize=64)
+def pyramid_weights(size: int, levels: int) -> tuple[F64, ...]:
+    """Return the weights of an axis from each level of the pyramid to the next, [n, 4] each, with rows of sum 1.
+
+    Args:
+        size: Pixels of the image along the axis.
+        levels: Number of halvings.
+    """
+    area = np.ones(size)
+    weights_by_level = []
+    for _ in range(levels):
+        weights = halving_weights(len(area))
+        taps = 2 * np.arange(len(weights))[:, None] + np.arange(-1, 3)
+        weighted = weights * area[np.clip(taps, 0, len(area) - 1)]
+        area = weighted.sum(1)
+        weights_by_level.append(weighted / area[:, None])
+    return tuple(weights_by_level)
+
+
+def level_count(height: int, width: int) -> int:
+    """Return the number of halvings of an image of a size in px, at least 1."""
+    return max(1, int(math.log2(min(height, width) / SMALLEST)))
+
+
+def level_spread(level: int) -> float:
+    """Return the standard deviation of the point spread of a level, px of the image."""
+    return math.sqrt(0.5 * (4.0**level - 1.0))
+
+
+def glare_weights(sensor: SensorModel, height: int, width: int) -> F64:
+    """Return the share of the light that each level of the pyramid scatters [levels], the finest first.
+
+    Args:
+        sensor: Sensor with glare and focal length.
+        height: Pixels of the image.
+        width: Pixels of the image.
+    """
+    degrees = math.degrees(1.0 / (sensor.focal * width))  # angle of a pixel
+    spreads = np.array([level_spread(level) for level in range(1, level_count(height, width) + 1)]) * degrees
+    veil = np.zeros(len(spreads))
+    for factor, exponent in VEIL:
+        mixture = 4.0 * math.pi / (2.0 ** (0.5 * exponent) * math.gamma(0.5 * exponent))
+        veil += factor * mixture * spreads ** (2.0 - exponent)
+    # An octave of widths; square degrees to steradians.
+    octave = math.log(2.0) * math.radians(1.0) ** 2
+    return np.asarray(sensor.glare * octave * veil * np.exp(-0.5 * (CORE / spreads) ** 2))
+
+
+def direct_share(sensor: SensorModel, weights: F64) -> float:
+    """Return the share of the light that is neither scattered nor reflected."""
+    return float(1.0 - weights.sum() - len(GHOSTS) * sensor.flare * REFLECTION**2)
+
+
+def ghost_lights(sensor: SensorModel) -> list[tuple[float, tuple[float, ...]]]:
+    """Return the size of each ghost, and its radiance for a radiance of 1, RGB."""
+    return [(size, tuple(sensor.flare * REFLECTION**2 * value / size**2 for value in tint)) for size, tint in GHOSTS]
+
+
+def ghost_source_level(height: int, width: int) -> int:
+    """Return the level of the pyramid whose blur ghosts have: a fortieth of the width of the image."""
+    # A finer one would fall between the pixels of the level that shows the ghosts.
+    return min(level_count(height, width), max(GHOST_LEVEL + 1, round(math.log2(width / 40))))
+
+
+def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
+    """Return the radiance behind the lenses of sensors.
+
+    Args:
+        radiance: Linear [B, H, W], a Warp array of vec3.
+        sensors: Sensor of each image.
+
+    Returns:
+        The same, in a new array; the array itself if no sensor has glare or flare. Images of other sensors are copied.
+    """
+    if not any(sensor.scatters for sensor in sensors):
+        return radiance
+    device, (count, height, width) = radiance.device, radiance.shape
+    levels = level_count(height, width)
+    weights = np.array([glare_weights(sensor, height, width) for sensor in sensors])
+    pyramid = [radiance]
+    for row_weights, column_weights in zip(
+        pyramid_weights(height, levels), pyramid_weights(width, levels), strict=True
+    ):
+        half = wp.empty((count, len(row_weights), len(column_weights)), dtype=wp.vec3, device=device)
+        taps = [
+            wp.array(values.astype(np.float32), dtype=float, device=device) for values in (row_weights, column_weights)
+        ]
+        wp.launch(kernels.shrink, dim=half.shape[:2], inputs=[pyramid[-1], *taps], outputs=[half], device=device)
+        pyramid.append(half)
+    ghost_level, scattered = min(GHOST_LEVEL, levels), pyramid[-1]
+    for level in range(levels, 0, -1):
+        total = wp.empty(pyramid[level].shape, dtype=wp.vec3, device=device)
+        shares = wp.array(weights[:, level - 1].astype(np.float32), dtype=float, device=device)
+        inputs = [pyramid[level], scattered, shares, float(level < levels)]
+        wp.launch(kernels.gather, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
+        if level == ghost_level and any(sensor.flare > 0.0 for sensor in sensors):
+            source = ghost_source_level(height, width)
+            rows: Any = np.array([ghost_lights(sensor) for sensor in sensors], kernels.Ghost.numpy_dtype())  # type: ignore[attr-defined]
+            centres = wp.array(np.tile([0.5 * width, 0.5 * height], (count, 1)), dtype=wp.vec2, device=device)
+            inputs = [
+                pyramid[source],
+                wp.array(rows, dtype=kernels.Ghost, device=device),
+                centres,
+                float(2**level),
+                float(2**source),
+            ]
+            wp.launch(kernels.add_ghosts, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
+        scattered = total
+    shares = [
+        direct_share(sensor, values) if sensor.scatters else 1.0
+        for sensor, values in zip(sensors, weights, strict=True)
+    ]
+    direct = wp.array(np.array(shares, np.float32), dtype=float, device=device)
+    out = wp.empty(radiance.shape, dtype=wp.vec3, device=device)
+    wp.launch(kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=device)
+    return out
+
+
+def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: Sequence[tuple[Any, ...]]) -> None:
+    """Add the disc of the sun to the sky of views whose sensor scatters, with all the light that the sun sends.
+
+    Other views stay as they are: in theirs the sun is a bright spot that is wider than the disc and weaker.
+
+    Args:
+        radiance: Linear [B, H, W], a Warp array of vec3; changed in place.
+        tag: [B, H, W], a Warp array; -1 is the sky.
+        views: The views.
+        lens: fx, fy, cx, cy of each view, px [B, 4].
+        lights: Light of each view, see `ssad.rendering.camera.kernels.sky.Light`.
+    """
+    height, width = radiance.shape[1:]
+    rows: Any = []
+    side = 0
+    for view, (focal_x, focal_y, centre_x, centre_y), light in zip(views, lens, lights, strict=True):
+        right, down, ahead = view.pose[:3, :3].T @ np.asarray(light[0])
+        strength = np.asarray(light[1]) * (1.0 - 0.9 * light[6])
+        radius = SUN_RADIUS * math.sqrt(focal_x * focal_y)
+        column = focal_x * right / max(ahead, 1e-9) + centre_x
+        row = focal_y * down / max(ahead, 1e-9) + centre_y
+        is_visible = view.sensor.scatters and ahead > 0.0 and strength.max() > 0.0
+        is_visible &= -radius < column < width + radius and -radius < row < height + radius
+        # The disc sends the irradiance of the sun; it is pi times the colour, and spread over the disc's solid angle.
+        disc = strength / math.sin(SUN_RADIUS) ** 2 if is_visible else np.zeros(3)
+        side = max(side, 2 * math.ceil(radius) + 3 if is_visible else 0)
+        rows.append((column if is_visible else 0.0, row if is_visible else 0.0, radius, tuple(disc)))
+    if side:
+        table: Any = np.array(rows, kernels.SunDisc.numpy_dtype())  # type: ignore[attr-defined]
+        discs = wp.array(table, dtype=kernels.SunDisc, device=radiance.device)
+        wp.launch(
+            kernels.add_sun, dim=(len(views), side, side), inputs=[discs, tag, side, radiance], device=radiance.device
+        )

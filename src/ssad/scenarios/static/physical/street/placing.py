@@ -1,0 +1,159 @@
+"""Edits of a street on recorded images: behind a recorded target, and painted on the road of a recorded scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from ssad.core.boxes import UNIT_CORNERS
+from ssad.core.frames import Camera
+from ssad.core.rotations import upright_pose
+from ssad.core.types import F32, F64, U8
+from ssad.datasets.nuscenes.files import read_frame_image
+from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.rendering.target import TargetCar
+from ssad.scenarios.static.perturbation import PerturbedScene, RecordedScene
+
+ROAD_ALBEDO: Final = 0.09  # of the asphalt that a recorded image is taken to show
+NEAREST: Final = 0.5  # m: nearer points of an outline are behind the camera
+
+
+def behind_target(edit: SceneEdit, distance: float) -> SceneEdit:
+    """Return an edit of the street in the frame of a target: its place lies behind the rear, on the road.
+
+    Args:
+        edit: The edit in the frame of its place.
+        distance: m from the rear of a car to the place.
+    """
+    lower, _ = TargetCar().mesh().bounds()
+    shift = np.eye(4)
+    shift[0, 3] = float(lower[0]) - distance
+    return replace(
+        edit,
+        lamps=tuple(replace(lamp, pose=shift @ lamp.pose) for lamp in edit.lamps),
+        decals=tuple(replace(decal, pose=shift @ decal.pose) for decal in edit.decals),
+    )
+
+
+def painted_scene(
+    scene: RecordedScene,
+    colour: Tensor,
+    size: tuple[float, float],
+    *,
+    distance: float,
+    light: float | None = None,
+    mask: F32 | None = None,
+) -> PerturbedScene:
+    """Return the camera images of a recorded scene with a texture on the road ahead of the ego's first pose.
+
+    The road is the plane under the wheels of the ego at that moment. Annotated boxes stand before the texture; nothing
+    else hides it.
+
+    Args:
+        scene: The recorded scene.
+        colour: Linear albedo, or share of the projected light [3, H, W], rows from the far edge to the near one.
+        size: m along and across the road.
+        distance: m from the first pose of the ego to the middle of the texture.
+        light: Light of a white texel, as a multiple of the light that the road receives; None: the texture is painted.
+        mask: Opacity of each texel [H, W]; None: 1.
+    """
+    cameras = [frame for frame in scene.data.frames if frame.modality == "camera"]
+    place = cameras[0].ego_to_world @ upright_pose(distance, 0.0, 0.0) if cameras else np.eye(4)
+    texture = np.moveaxis(colour.numpy().astype(np.float32), 0, -1)
+    opacity = np.ones(texture.shape[:2], np.float32) if mask is None else mask
+
+    def load(frames: Sequence[SensorFrame]) -> list[U8]:
+        images = []
+        for frame in frames:
+            image = read_frame_image(scene.root, frame)
+            if frame.intrinsic is not None:
+                camera = Camera(image.shape[1], image.shape[0], frame.intrinsic, frame.sensor_to_ego, frame.channel)
+                hidden = _outlines(scene, frame, camera)
+                image = paint_road(
+                    image, camera, frame.ego_to_world, place, size, texture, light=light, opacity=opacity, hidden=hidden
+                )
+            images.append(image)
+        return images
+
+    return PerturbedScene(load)
+
+
+def paint_road(
+    image: U8,
+    camera: Camera,
+    ego_to_world: F64,
+    place: F64,
+    size: tuple[float, float],
+    texture: F32,
+    *,
+    light: float | None,
+    opacity: F32,
+    hidden: Sequence[F32] = (),
+) -> U8:
+    """Return an image with a texture on the road.
+
+    Args:
+        image: uint8 [H, W, 3].
+        camera: Its camera.
+        ego_to_world: Pose of the ego [4, 4].
+        place: Pose of the middle of the texture [4, 4]: x along the road, y to the left, on the road.
+        size: m along and across the road.
+        texture: Linear RGB [h, w, 3].
+        light: See `painted_scene`.
+        opacity: [h, w].
+        hidden: Outlines [N, 2], px, of what stands before it.
+    """
+    length, width = size
+    corners = np.array([(0.5 * length, 0.5 * width), (0.5 * length, -0.5 * width)])
+    corners = np.concatenate([corners, -corners])  # far left, far right, near right, near left
+    points = np.column_stack([corners, np.zeros(4), np.ones(4)]) @ place.T
+    to_camera = np.linalg.inv(ego_to_world @ camera.to_ego)
+    in_camera = (points @ to_camera.T)[:, :3]
+    if (in_camera[:, 2] < NEAREST).any():
+        return image  # partly behind the camera
+    pixels = in_camera @ camera.intrinsic.T
+    pixels = (pixels[:, :2] / pixels[:, 2:]).astype(np.float32)
+    rows, columns = opacity.shape
+    source = np.array([(0, 0), (columns, 0), (columns, rows), (0, rows)], np.float32)
+    # Pixel centres lie at half numbers in the image, at whole numbers in OpenCV.
+    homography = cv2.getPerspectiveTransform(source - 0.5, pixels - 0.5)
+    frame_size = (image.shape[1], image.shape[0])
+    warped = cv2.warpPerspective(texture, homography, frame_size, flags=cv2.INTER_LINEAR)
+    share = cv2.warpPerspective(opacity.astype(np.float32), homography, frame_size, flags=cv2.INTER_LINEAR)
+    for outline in hidden:
+        cv2.fillConvexPoly(share, np.rint(outline).astype(np.int32), 0.0)
+    road = decode(image)
+    changed = road * warped / ROAD_ALBEDO if light is None else road * (1.0 + light * warped)
+    return encode(road + share[..., None] * (changed - road))
+
+
+def decode(image: U8) -> F32:
+    """Return the linear values of an sRGB image, 0 to 1."""
+    share = image.astype(np.float32) / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encode(linear: F32) -> U8:
+    """Return the sRGB image of linear values; what is above 1 is full."""
+    clipped = np.clip(linear, 0.0, 1.0)
+    share = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055)
+    return np.rint(255.0 * share).astype(np.uint8)
+
+
+def _outlines(scene: RecordedScene, frame: SensorFrame, camera: Camera) -> list[F32]:
+    """Return the outlines [N, 2] of the annotated boxes that lie in front of a camera, px."""
+    boxes = scene.data.annotations_at(frame.timestamp_us)
+    corners = boxes.corners().reshape(-1, 3)
+    in_camera = (corners - (frame.ego_to_world @ camera.to_ego)[:3, 3]) @ (frame.ego_to_world @ camera.to_ego)[:3, :3]
+    outlines = []
+    for box in in_camera.reshape(-1, len(UNIT_CORNERS), 3):
+        if (box[:, 2] > NEAREST).all():
+            pixels = box @ camera.intrinsic.T
+            outlines.append(cv2.convexHull((pixels[:, :2] / pixels[:, 2:]).astype(np.float32))[:, 0])
+    return outlines
