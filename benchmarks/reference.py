@@ -38,6 +38,7 @@ STABLE = (
     "attacks",
     "losses",
     "defences",
+    "dimensions",
 )
 """Lists of `ssad list` that depend on the installed package alone, not on what has been imported."""
 KINDS_OF_VALUE = {"str": "text", "int": "integer", "float": "number"}

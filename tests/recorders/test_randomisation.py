@@ -53,7 +53,7 @@ def test_names_and_files_choose_dimensions(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="dimension of the randomisation"):
+    with pytest.raises(UnknownNameError, match=r"unknown dimension 'focus'.*ssad list dimensions"):
         parse_randomisation("all,-focus")
     for content, message in (
         ("noise: [0.02, 0.01]", "noise from 0.02 to 0.01; give a range within"),

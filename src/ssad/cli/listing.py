@@ -181,6 +181,12 @@ def _recipe_list() -> dict[str, str]:
     }
 
 
+def _dimension_list() -> dict[str, str]:
+    from ssad.recorders.randomisation import DIMENSIONS
+
+    return {name: dimension.describe() for name, dimension in DIMENSIONS.items()}
+
+
 LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "suites": _suite_list,
     "kinds": _kind_list,
@@ -199,6 +205,7 @@ LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "defences": _defence_list,
     "simulators": _simulator_list,
     "towns": _town_list,
+    "dimensions": _dimension_list,
 }
 """What can be listed -> makes its rows: name, and what it is."""
 ALIASES: Final = {"agents": "systems"}

@@ -93,6 +93,7 @@ LISTED = (
     "defence",
     "simulator",
     "town",
+    "dimension",
 )
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
 

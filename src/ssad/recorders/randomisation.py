@@ -51,6 +51,12 @@ class Dimension:
     scale: Literal["uniform", "log"] = "uniform"
     subject: Literal["vehicle", "camera"] = "camera"
 
+    def describe(self) -> str:
+        """Return subject, summary and default range in words."""
+        scale = ", logarithmic" if self.scale == "log" else ""
+        values = f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
+        return f"{self.subject}: {self.summary}; {values}{scale}"
+
 
 # Axalta, 68th Global Automotive Color Popularity Report (2020), per cent of new cars; 4 % of other colours.
 COLOUR_SHARES: Final[Mapping[str, float]] = {
@@ -78,8 +84,7 @@ DIMENSIONS: Final[Mapping[str, Dimension]] = {
     for dimension in (
         Dimension(
             "paint",
-            "colour of cars, by published shares; the value is the spread of its brightness (standard deviation of "
-            "the logarithm)",
+            "colour of cars by published shares, with this deviation of the logarithm of its brightness",
             0.15,
             0.15,
             (0.0, 1.0),
@@ -204,7 +209,7 @@ class Randomisation:
     def __post_init__(self) -> None:
         for name, low, high in self.ranges:
             if name not in DIMENSIONS:
-                raise unknown_name("dimension of the randomisation", name, DIMENSIONS)
+                raise unknown_name("dimension", name, DIMENSIONS)
             least, most = DIMENSIONS[name].bounds
             if not least <= low <= high <= most:
                 raise ConfigError(
@@ -321,7 +326,7 @@ def parse_randomisation(text: str) -> Randomisation:
         names = list(DIMENSIONS) if name == "all" else [name]
         for dimension_name in names:
             if dimension_name not in DIMENSIONS:
-                raise unknown_name("dimension of the randomisation", dimension_name, DIMENSIONS)
+                raise unknown_name("dimension", dimension_name, DIMENSIONS)
             if word.startswith("-"):
                 ranges.pop(dimension_name, None)
             else:
@@ -338,7 +343,7 @@ def _read_randomisation(path: Path) -> Randomisation:
     ranges: dict[str, tuple[float, float]] = {}
     for name, setting in settings.items():
         if name not in DIMENSIONS:
-            raise unknown_name("dimension of the randomisation", str(name), DIMENSIONS)
+            raise unknown_name("dimension", str(name), DIMENSIONS)
         if setting is True:
             ranges[name] = DIMENSIONS[name].low, DIMENSIONS[name].high
         elif (

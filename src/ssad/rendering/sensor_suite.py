@@ -99,7 +99,13 @@ class SensorSuite:
 
     def build(self) -> dict[str, Sensor]:
         """Return the sensors by name, as `ssad.world.rollout.rollout` takes them; images stay on a GPU."""
-        onboard = Onboard(weather=self.weather, device=self.device, resident=True, attack=self.agent_edit, street_edit=self.street_edit)
+        onboard = Onboard(
+            weather=self.weather,
+            device=self.device,
+            resident=True,
+            attack=self.agent_edit,
+            street_edit=self.street_edit,
+        )
         sensors: dict[str, Sensor] = dict(onboard.group_cameras(self.cameras))
         sensors |= {name: make(onboard, self.cameras[name]) for name, make in self.camera_sensors.items()}
         sensors |= {name: onboard.lidar(lidar) for name, lidar in self.lidars.items()}

@@ -55,16 +55,19 @@ def _panel(title: str, lines: Mapping[str, Course], top: int) -> list[str]:
         elements.append(label_text(x(along), top + HEIGHT + 15, f"{along:.0f} m", anchor="middle"))
     for side in (1.0, -1.0):
         points = _points([(x(along), y(side * width)) for along, width in zip(longest["along"], longest["margin"])])
-        elements.append(
-            element("polyline", points=points, fill="none", stroke="var(--soft)", stroke_dasharray="1 4")
-        )
+        elements.append(element("polyline", points=points, fill="none", stroke="var(--soft)", stroke_dasharray="1 4"))
     for index, (name, course) in enumerate(lines.items()):
         colour, dashes = series_colour(index), DOTS[(index // 5) % len(DOTS)]
         points = _points([(x(along), y(value)) for along, value in zip(course["along"], course["deviation"])])
         tip = element("title", escape(name))
         elements.append(
             element(
-                "polyline", tip, points=points, fill="none", stroke=colour, stroke_width=2,
+                "polyline",
+                tip,
+                points=points,
+                fill="none",
+                stroke=colour,
+                stroke_width=2,
                 stroke_dasharray=dashes or None,
             )
         )
@@ -72,8 +75,14 @@ def _panel(title: str, lines: Mapping[str, Course], top: int) -> list[str]:
         legend_x, legend_y = LEFT + column * WIDTH / 3, top + HEIGHT + 34 + LEGEND * row
         elements.append(
             element(
-                "line", x1=legend_x, x2=legend_x + 18, y1=legend_y - 4.0, y2=legend_y - 4.0, stroke=colour,
-                stroke_width=2, stroke_dasharray=dashes or None,
+                "line",
+                x1=legend_x,
+                x2=legend_x + 18,
+                y1=legend_y - 4.0,
+                y2=legend_y - 4.0,
+                stroke=colour,
+                stroke_width=2,
+                stroke_dasharray=dashes or None,
             )
         )
         elements.append(label_text(legend_x + 23, legend_y, name))

@@ -304,7 +304,9 @@ def lane_table(run: Run) -> Table:
         rows=CONDITION,
         columns=LANES,
         metric=_cell,
-        condition=lambda lines: any(metric_of(line, "lane_deviation") == metric_of(line, "lane_deviation") for line in lines),
+        condition=lambda lines: any(
+            metric_of(line, "lane_deviation") == metric_of(line, "lane_deviation") for line in lines
+        ),
         note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, route completed. "
         "A drive leaves the lane where the body crosses a line; after: from the moment when the cause comes into view, "
         "or from the start where there is none, of the drives that do. From the middle: mean distance to it. Error of "

@@ -24,7 +24,14 @@ from ssad.rendering.camera.scene import TextureDecal
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.street_edit import StreetEdit
-from ssad.scenarios.static.perturbation import EGO, Perturbation, PerturbedScene, RecordedScene, SceneVictim, TargetImages
+from ssad.scenarios.static.perturbation import (
+    EGO,
+    Perturbation,
+    PerturbedScene,
+    RecordedScene,
+    SceneVictim,
+    TargetImages,
+)
 from ssad.scenarios.static.physical.textures.card import load_texture
 
 if TYPE_CHECKING:

@@ -31,7 +31,14 @@ from ssad.rendering.hours import HOURS, SUN, at_hour
 from ssad.rendering.meshes.mesh import Material, Mesh
 from ssad.rendering.meshes.mesh import build as build_mesh
 from ssad.rendering.street_edit import StreetEdit
-from ssad.scenarios.static.perturbation import EGO, Perturbation, PerturbedScene, RecordedScene, SceneVictim, TargetImages
+from ssad.scenarios.static.perturbation import (
+    EGO,
+    Perturbation,
+    PerturbedScene,
+    RecordedScene,
+    SceneVictim,
+    TargetImages,
+)
 from ssad.scenarios.static.physical.lights.light import aimed_poses, first_array
 from ssad.scenarios.static.physical.street.dirty_road import EDGE, has_place
 from ssad.scenarios.static.physical.street.placing import behind_target, decode, painted_scene

@@ -1,0 +1,104 @@
+"""Cost of the effects of the rendering: python benchmarks/effect_cost.py [--effects NAME,...] [--out FILE]
+
+The street of `camera_speed.py` by day and with a low sun ahead, 640 x 640 and 640 x 384 pixels, on one core. A picture
+without any effect and one with an effect are rendered in turn; the cost is the median of the differences in process
+time, so that a busy machine slows both alike. `finish` is metallic paint, dirt and wear on all vehicles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from camera_speed import scene
+
+from ssad.core.frames import Camera
+from ssad.rendering.camera.effects import EFFECTS, NO_EFFECTS, select_effects
+from ssad.rendering.camera.render import RenderQuality, View, render
+from ssad.rendering.camera.scene import Finish, RenderScene
+
+FINISH = Finish(metallic=0.5, dirt=0.5, wear=0.5)
+
+
+def seconds_of(run: Callable[[], object]) -> float:
+    """Process time of a call."""
+    begin = time.process_time()
+    run()
+    return time.process_time() - begin
+
+
+def cost(base: Callable[[], object], changed: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Return the median seconds of a call, and of what another takes in addition, in turn."""
+    for run in (base, changed):
+        run()
+    pairs = [(seconds_of(base), seconds_of(changed)) for _ in range(repeats)]
+    return statistics.median(before for before, _ in pairs), statistics.median(
+        after - before for before, after in pairs
+    )
+
+
+def views_of(view: View) -> dict[str, View]:
+    """Return the view at 640 x 640 and at 640 x 384, by day and with a low sun ahead."""
+    heading = float(np.arctan2(view.pose[1, 2], view.pose[0, 2]))
+    low = replace(view.weather, sun_height=0.15, sun_heading=heading + 0.1)
+    wide = Camera.typical(640, 384)
+    return {
+        "640 x 640": view,
+        "640 x 384": replace(view, camera=wide),
+        "640 x 640, low sun": replace(view, weather=low),
+    }
+
+
+def finished(view: View) -> View:
+    """Return the view with a finish on everything that wears no texture."""
+    return replace(view, objects=tuple(replace(scene_object, finish=FINISH) for scene_object in view.objects))
+
+
+def measure(stage: RenderScene, view: View, names: list[str], repeats: int) -> dict[str, Any]:
+    """Return the milliseconds of a view without effects, and of each effect in addition."""
+    plain = RenderQuality(effects=NO_EFFECTS)
+    base = partial(render, stage, [view], quality=plain, download=False)
+    found: dict[str, Any] = {}
+    for name in names:
+        if name == "finish":
+            changed = partial(render, stage, [finished(view)], quality=plain, download=False)
+        else:
+            quality = RenderQuality(effects=select_effects(name))
+            changed = partial(render, stage, [view], quality=quality, download=False)
+        before, additional = cost(base, changed, repeats)
+        found.setdefault("ms_without", 1e3 * before)
+        found[name] = {"ms": 1e3 * additional, "ratio": additional / before}
+    return found
+
+
+def main() -> None:
+    """Measures, prints, writes JSON."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--effects", default=",".join([*EFFECTS, "finish"]))
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    stage, view = scene(640, "cpu")
+    result = {}
+    for size, sized in views_of(view).items():
+        result[size] = measure(stage, sized, options.effects.split(","), options.repeats)
+        print(f"{size}: {result[size]['ms_without']:.0f} ms without effects")
+        for name in options.effects.split(","):
+            print(f"  {name}: {result[size][name]['ms']:+.1f} ms ({result[size][name]['ratio']:+.1%})")
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
