@@ -17,6 +17,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pytest
+from helpers.photographs import write_list
 from helpers.quick import others_slow
 from helpers.sharing import Shared
 from helpers.template import PACKAGE, PROJECT, installed_template
@@ -83,10 +84,12 @@ SUITES: dict[str, dict[str, Any]] = {
     "detection": {"detectors": ["fcos3d-light"], "shifts": ["fog"], "severities": [3]},
     "digital": {"detectors": ["yolov5n"], "attacks": ["fgsm"]},
     "physical": {"detectors": ["yolov5n"], "attacks": ["grey"], "seeds": 1},
+    "reality": {"detectors": ["yolov5n"], "data": "PHOTOGRAPHS"},
     "tour": {"parts": [{"name": "part", "suite": "quick"}]},
     "example-coin": {"systems": ["penny"]},
 }
-"""The smallest suite of each kind; a case changes one key of it. SHORT: a scenario of a second."""
+"""The smallest suite of each kind; a case changes one key of it. SHORT: a scenario of a second; PHOTOGRAPHS: a folder
+of two."""
 
 
 def reference(name: str, options: Options, label: str = "") -> str:
@@ -185,6 +188,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "size": 128,
         "floor": 0.0,
     },
+    "reality": {"detectors": ["example-smoothed"]},
     "tour": {"parts": [{"name": "part", "suite": "COIN ssad_example.kind:Coin"}]},
     "example-coin": {"kind": "ssad_example.kind:Coin"},
 }
@@ -266,6 +270,7 @@ CASES: dict[tuple[str, str], Case] = {
         partial(loss_of, lambda loss: {"attacks": [{"name": "vanishing", "settings": {"objective": loss}}]}),
     ),
     ("physical", "lights.name"): ("light", row("lights", hour="night")),
+    ("reality", "detectors"): ("detector", named("detectors")),
     ("tour", "parts.suite"): ("kind", lambda name, options: {"parts": [{"name": "part", "suite": f"COIN {name}"}]}),
     ("example-coin", "kind"): ("kind", lambda name, options: {"kind": name}),
 } | {
@@ -314,6 +319,10 @@ NOT_OBJECTS: dict[str, str] = {
     "DetectorTable.data": "a folder",
     "DetectorTable.version": "a version of its data",
     "DetectorTable.split": "a split of its data",
+    "RealitySuite.data": "a folder",
+    "RealitySuite.split": "a split of its data",
+    "RealitySuite.textures": "a texture is data: its card, or an exported folder",
+    "RealitySuite.controls": "untrained textures, of the kind's own",
     "RecordedData.towns": "towns: maps that are imported, not code",
     "PerceptionSuite.target_town": "a town",
     "Pair.train": "a town",
@@ -418,6 +427,8 @@ def suite_file(folder: Path, kind: str, changes: Mapping[str, Any]) -> Path:
     data = {"kind": kind, "name": "contract", **SUITES[kind], **changes}
     if "SHORT" in data.get("scenarios", ()):
         data["scenarios"] = [str(folder / "short.yaml")]
+    if data.get("data") == "PHOTOGRAPHS":
+        data["data"] = str(write_list(folder / "photographs"))
     for part in data.get("parts", ()):
         if part["suite"].startswith("COIN "):
             coin = {"kind": part["suite"].removeprefix("COIN "), "name": "coin", "systems": ["penny"]}

@@ -18,6 +18,7 @@ from helpers.generated import generated
 from ssad.core.errors import FormatError
 from ssad.core.types import (
     Actor,
+    Body,
     Episode,
     EpisodeLimits,
     EpisodeTrace,
@@ -294,6 +295,43 @@ def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
     way = trace.x[:, 1] - trace.x[0, 1]
     assert np.abs(trace.y[way < 10.0, 1] + 1.75).max() < 0.2
     assert np.abs(trace.y[way > 35.0, 1] + 5.25).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("name", "category", "size", "model"),
+    [
+        ("NCAP_GlobalVehicleTarget", "car", (4.023, 1.712, 1.427), "euroncap_vehicle"),
+        ("GVT", "car", (4.1, 1.712, 1.427), "euroncap_vehicle"),
+        ("NCAP_Bicycle", "bicycle", (1.89, 0.5, 1.2), "euroncap_bicycle"),
+        ("EMT", "motorbike", (2.08, 0.79, 1.06), "euroncap_motorcycle"),
+        ("NCAP_Adult", "pedestrian", (0.6, 0.5, 1.8), "euroncap_adult"),
+        ("EPTc", "pedestrian", (0.711, 0.298, 1.154), "euroncap_child"),
+    ],
+)
+def test_a_test_target_is_known_by_its_name(
+    name: str, category: str, size: tuple[float, float, float], model: str, tmp_path: Path
+) -> None:
+    """Catalogue names of Vector's NCAP scenarios, and the abbreviations of the protocols."""
+    length, width, height = size
+    box = f'<Dimensions width="{width}" length="{length}" height="{height}"/>'
+    vehicle = 'Vehicle name="vehicle.some.body" vehicleCategory="car"'
+    text = FOREIGN.replace('<Dimensions width="2.0" length="4.5" height="1.8"/>', box)
+    if category == "pedestrian":
+        start = text.index(f"<{vehicle}>")
+        end = text.index("</Vehicle>", start)
+        body = text[start:end].replace(vehicle, f'Pedestrian name="{name}" pedestrianCategory="pedestrian" mass="0"')
+        text = text[:start] + body + "</Pedestrian>" + text[end + len("</Vehicle>") :]
+        lateral = text.index('<Event name="cut in"')
+        text = text[:lateral] + text[text.index("</Event>", lateral) + len("</Event>") :]
+    else:
+        text = text.replace(vehicle, f'Vehicle name="{name}" vehicleCategory="{category}"')
+    path = tmp_path / "target.xosc"
+    path.write_text(text)
+    (actor,) = read_openscenario(path).scenario.actors
+    assert actor.model == model
+    # The box of a two-wheeler in the catalogue ends below its rider.
+    stated = replace(actor.body, max_speed=None)
+    assert stated == (Body(length=4.1) if name == "GVT" else Body())
 
 
 LATER = """<Event name="stop" priority="overwrite"><Action name="stop"><PrivateAction><LongitudinalAction><SpeedAction>

@@ -35,7 +35,7 @@ from ssad.recorders.nuscenes import AHEAD, Recording, drive_with_autopilot, reco
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.bodies import make_body
-from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, towing_vehicle
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.scene_objects import CARS, RACK, SceneObjects, place_objects
 from ssad.rendering.street import cached_street
@@ -156,7 +156,8 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another() -> None:
         kinds.update(body.kind for body in cast.bodies)
         now = cast.at(3.0, np.array([trace.x[30, 0], trace.y[30, 0]]), 80.0)
         assert len(now) > 8
-        still = [s for s in now if s.body.is_parked and s.body.kind != "bicycle"]
+        # A trailer lies on the vehicle that draws it.
+        still = [s for s in now if s.body.is_parked and s.body.kind not in ("bicycle", "trailer")]
         boxes = [(*s.pose[:2, 3], np.arctan2(s.pose[1, 0], s.pose[0, 0]), *s.body.size[:2]) for s in still]
         for i in range(1, len(boxes)):
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
@@ -291,6 +292,12 @@ def test_long_vehicles_stand_at_the_kerb() -> None:
             others = [b for b in wide if b is not body]
             gap = [float(np.hypot(*(b.track[0, :2] - body.track[0, :2]))) for b in others]
             assert min(gap, default=9.0) > 1.5
+        for trailer in (body for body in parked if body.kind == "trailer"):
+            x, y, yaw, _ = trailer.track[0]
+            vehicle = towing_vehicle(trailer.style, trailer.size)
+            place = x + vehicle.ahead * np.cos(yaw), y + vehicle.ahead * np.sin(yaw)
+            before = [b for b in parked if np.hypot(*(b.track[0, :2] - place)) < 1e-6]
+            assert [(b.kind, b.style) for b in before] == [(vehicle.kind, vehicle.style)], "no trailer stands alone"
     assert {"car", "truck", "bus", "trailer"} <= set(found)
     assert found["car"] > found["truck"] > 0.05 * found["car"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.bodies import plain_bodies
+from helpers.photographs import CARS, ORANGE, write_bdd100k, write_coco, write_kitti
 from helpers.sharing import Shared
 from PIL import Image
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
@@ -23,7 +25,8 @@ from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import parse_target
 from ssad.training import detector as training
-from ssad.training.detector import DetectorPlan, coco_items, command_of, describe_data, run_training
+from ssad.training.data import photograph_items
+from ssad.training.detector import DetectorPlan, coco_items, command_of, describe_data, flat_items, run_training
 from ssad.training.recipe import find_recipe
 
 SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
@@ -172,10 +175,60 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
 
 
 def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
+    recipe = find_recipe("fcos3d-light")
     (one, _), (two, _) = (
-        training._items(DetectorPlan("fcos3d-light", n * (drives,), Path("out")), is_3d=True) for n in (1, 2)
+        training._items(DetectorPlan("fcos3d-light", n * (drives,), Path("out")), recipe) for n in (1, 2)
     )
     assert len(two) == 2 * len(one) > 0
+
+
+def test_a_2d_detector_learns_from_photographs(tmp_path: Path) -> None:
+    data = write_coco(tmp_path / "data")
+    changes = (("epochs", 1), ("batch", 2), ("validate", 1), ("photo_size", (64, 96)))
+    plan = DetectorPlan("yolov5n", (data,), tmp_path / "out", "train2017", "val2017", changes, device="cpu")
+    said: list[str] = []
+    list(run_training(plan, report=said.append))
+    assert any(line.startswith("2 pictures to learn from") for line in said)
+    card = read_card(tmp_path / "out" / "yolov5n.safetensors")
+    assert card.learned_from == "other data (data)"
+    assert card.classes == read_card(SHIPPED / "yolov5n.json").classes
+    assert "data_AP50_car" in card.metrics
+    assert "--set 'photo_size=[64,96]'" in card.command
+
+
+@pytest.mark.parametrize(("write", "split"), [(write_coco, "val2017"), (write_bdd100k, "val"), (write_kitti, "val")])
+def test_photographs_of_every_form_can_be_learned_from(
+    write: Callable[[Path], Path], split: str, tmp_path: Path
+) -> None:
+    plan = DetectorPlan("yolov5n", (write(tmp_path / "data"),), tmp_path, split, split)
+    sources, options = training._items(plan, find_recipe("yolov5n"), report=lambda line: None)
+    assert options["classes"] == read_card(SHIPPED / "yolov5n.json").classes
+    assert sources[0].read().shape == (384, 640, 3)
+    labels = [sources[0].truth.label[~crowd].tolist() for crowd in [sources[0].truth.crowd] if crowd is not None]
+    assert labels == [[0]]
+
+
+def test_photographs_are_fitted_with_their_boxes(tmp_path: Path) -> None:
+    names, items = photograph_items(write_coco(tmp_path), "val2017", (48, 80))
+    assert names == read_card(SHIPPED / "yolov5n.json").classes
+    for item, scale, car in zip(items, (0.5, 0.5), CARS, strict=True):
+        image = item.read()
+        assert image.shape == (48, 80, 3)
+        assert item.truth.crowd is not None
+        is_car = ~item.truth.crowd
+        assert [names[label] for label in item.truth.label[is_car]] == ["car"]
+        x1, y1, x2, y2 = (round(edge) for edge in item.truth.box[is_car][0].tolist())
+        assert (x1, y1, x2, y2) == tuple(round(scale * edge) for edge in car)
+        assert np.abs(image[y1 + 1 : y2 - 1, x1 + 1 : x2 - 1].astype(int) - ORANGE).max() < 8
+    assert (items[1].read()[:, 48:] == 114).all()
+
+
+def test_nuscenes_teaches_2d_detectors_too(tiny_set: Path) -> None:
+    recipe = find_recipe("yolov5n", photo_size=(45, 80))
+    names, items = flat_items(tiny_set, "", recipe)
+    assert items[0].read().shape == (45, 80, 3)
+    assert names[0] == "car"
+    assert sum(len(item.truth.label) for item in items) > 0
 
 
 def test_the_command_can_be_given_to_a_shell() -> None:

@@ -76,9 +76,14 @@ def import_map(
             help="Whether turns to the near side are allowed on red.  [default: by rule of the road and country]",
         ),
     ] = None,
-    signals: Annotated[
-        bool, typer.Option("--signals", help="Add traffic lights to junctions where ways meet and the file has none.")
-    ] = False,
+    uncontrolled: Annotated[
+        str,
+        typer.Option(
+            metavar="keep|slow|signals",
+            help="Junctions where ways meet without lights and signs: as in the file, 50 km/h across them, or that and "
+            "traffic lights.",
+        ),
+    ] = "keep",
     origin: Annotated[
         str | None,
         typer.Option(
@@ -114,6 +119,8 @@ def import_map(
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
+    if uncontrolled not in ("keep", "slow", "signals"):
+        raise ConfigError(f"--uncontrolled {uncontrolled}: choose keep, slow or signals")
     report = ImportReport(str(file))
     lanelet2 = _lanelet2_options(origin, projection, left_hand)
     # The line of progress stands on terminals alone, so that an error is the only line of a log.
@@ -125,7 +132,7 @@ def import_map(
             report=report,
             strict=strict,
             turn_on_red=turn_on_red,
-            signals=signals,
+            uncontrolled=uncontrolled,  # type: ignore[arg-type]
             progress=status.update,
             lanelet2=lanelet2,
         )

@@ -161,10 +161,16 @@ def _detector_list() -> dict[str, str]:
     def describe(name: str, origin: str) -> str:
         if origin.startswith("ssad."):
             kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
-            return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
+            if not (SHIPPED / f"{name}.json").is_file():
+                return f"{kind}, no weights shipped"
+            return f"{kind}, weights shipped, which learned from images that SSAD rendered"
         return origin
 
     rows = {name: describe(name, origin) for name, origin in detector_names().items()}
+    rows |= {
+        "centernet:FILE": "2D, learned from photographs: npm pack @vladmandic/human (docs/how-to/use-detectors.md)",
+        "onnx:FILE": "2D, an exported detector (docs/how-to/use-detectors.md)",
+    }
     return rows | {"module:object": "a detector of your own (docs/how-to/use-detectors.md)"}
 
 

@@ -23,7 +23,12 @@ def train_detector(
     recipe: Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a recipe (see: ssad list recipes).")],
     data: Annotated[
         Path,
-        typer.Option(help="3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote."),
+        typer.Option(
+            help=(
+                "3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote, or photographs of "
+                "COCO, KITTI, nuScenes or BDD100K."
+            )
+        ),
     ],
     more: Annotated[list[Path] | None, typer.Option(help="Another such folder; can be repeated.")] = None,
     val_data: Annotated[

@@ -53,6 +53,8 @@ class WeightsCard:
         config: Options of the builder.
         hash: SHA-256 of the tensors as stored (`hash_state`); `save_weights` fills it in.
         version: Version of SSAD; `save_weights` fills it in.
+        learned_from: Kind of images that the weights learned from, in words; "": not stated.
+        photographs: Scores on photographs (docs/results/reality.md), by name; empty: not measured.
     """
 
     data: str
@@ -63,6 +65,12 @@ class WeightsCard:
     config: Mapping[str, Any] = field(default_factory=dict)
     hash: str = ""
     version: str = ""
+    learned_from: str = ""
+    photographs: Mapping[str, float] = field(default_factory=dict)
+
+
+LATER_FIELDS = frozenset({"version", "learned_from", "photographs"})
+"""Fields that older cards do not have."""
 
 
 def hash_state(state: Mapping[str, Tensor]) -> str:
@@ -290,8 +298,9 @@ def read_card(path: str | Path) -> WeightsCard:
         "config": dict,
         "hash": str,
     }
-    if not isinstance(data, dict) or not required_names - {"version"} <= data.keys():
+    if not isinstance(data, dict) or not required_names - LATER_FIELDS <= data.keys():
         raise FormatError(f"{card_file}: not the card of weights: it needs {', '.join(sorted(required_names))}")
+    types_by_name |= {name: kind for name, kind in (("learned_from", str), ("photographs", dict)) if name in data}
     mistyped = [name for name, expected_type in types_by_name.items() if not isinstance(data[name], expected_type)]
     if mistyped or not all(isinstance(name, str) for name in data["classes"]):
         raise FormatError(f"{card_file}: '{(mistyped or ['classes'])[0]}' is of the wrong type")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ssad.core.types import Body, LateralPhase, Phase, Pose
 from ssad.interchange.openscenario_document import BODIES, AttributeReader
-from ssad.simulators.carla.blueprints import MODEL_OF, nearest_model
+from ssad.simulators.carla.blueprints import MODEL_OF, TARGET_OF, nearest_model
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS, model_with_body
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 EGO_NAMES: Final = ("ego", "hero", "ego_vehicle", "egovehicle")
+RIDDEN_TARGETS: Final = ("euroncap_bicycle", "euroncap_motorcycle")
 CLOSE: Final = 1e-6  # within which a body has the size and the limits of its model
 
 
@@ -165,7 +166,8 @@ def _entity(
         category = {"Pedestrian": "pedestrian", "MiscObject": "prop"}.get(body.tag)
         if category is None:
             category = values.text(body, "vehicleCategory")
-        nearest = MODEL_OF.get(values.text(body, "name", "")) or nearest_model(category, size)
+        body_name = values.text(body, "name", "")
+        nearest = MODEL_OF.get(body_name) or TARGET_OF.get(body_name.lower()) or nearest_model(category, size)
         if nearest is None:
             raise values.error(body, f"entity '{name}': nobody here is like a {category[:40]}")
         model = nearest
@@ -174,6 +176,8 @@ def _entity(
         if not 0.05 <= limit <= 30.0:
             doubts[f"the {key} of '{name}' of {limit:g} m: that of a {model} is taken"] += 1
             stated[key] = getattr(MODELS[model], key)
+    if model in RIDDEN_TARGETS:  # the box of the catalogue ends at the handlebar
+        stated["height"] = max(stated["height"], MODELS[model].height)
     performance = body.find("Performance")
     if performance is not None and MODELS[model].max_speed > 0.0:
         for key, attribute, highest in (

@@ -33,7 +33,7 @@ from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import check_streets, drive_street, make_drive
 from ssad.recorders.parts import TIME_LIMIT, PartsFolder
 from ssad.recorders.randomisation import NO_RANDOMISATION, CameraDraw, Randomisation, describe_bodies
-from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, category_of
 from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
@@ -193,7 +193,7 @@ def attributes_of(placed_object: PlacedObject) -> tuple[str, ...]:
     if body.kind == "pedestrian":
         return ("pedestrian.moving",) if moving else ("pedestrian.standing",)
     if body.kind in ("motorcycle", "bicycle"):
-        return ("cycle.with_rider",) if body.style == "ridden" else ("cycle.without_rider",)
+        return ("cycle.without_rider",) if body.style == "parked" else ("cycle.with_rider",)
     if body.kind in ("traffic_cone", "barrier"):
         return ()
     return ("vehicle.parked",) if body.is_parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
@@ -486,7 +486,7 @@ def _annotate(
             annotation_rows.append(
                 {
                     "tag": placed_object.body.tag,
-                    "category": BODY_CATEGORIES[placed_object.body.kind],
+                    "category": category_of(placed_object.body.kind, placed_object.body.style),
                     "attributes": list(attributes_of(placed_object)),
                     "centre": centre[row].tolist(),
                     "size": size[row].tolist(),

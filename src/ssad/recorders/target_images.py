@@ -41,6 +41,7 @@ from ssad.recorders.viewpoints import (
     AIM,
     Place,
     Viewpoint,
+    between,
     following_viewpoints,
     has_free_sight,
     has_room,
@@ -77,6 +78,7 @@ MAX_DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes o
 PLACE_TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
 TARGETS: Final = 5  # bodies that an orbit shows in turn
 SECONDS: Final = 24.0  # of a drive
+APPROACH_SECONDS: Final = 48.0  # of a drive in which the target is seen from far
 TARGET: Final = 1_000_000  # its tag
 HIDDEN: Final = 0.25  # visible share below which an object is crowd, as one with a side below SMALL
 MIN_VISIBLE_SHARE: Final = 0.6  # least visible share of the target, and least share of it inside the picture
@@ -111,8 +113,9 @@ class _TargetDrive:
 
 def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
     graph = load_town(town)
+    seconds = APPROACH_SECONDS if recording.approach else SECONDS
     street = drive_street(graph, recording.streets, key=("clips", *key))
-    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=seconds), graph)
     population = place_objects(trace, graph, street, key=key, many_signs=recording.streets == "any")
     places: tuple[Place, ...] = ()
     randomisation = recording.randomisation
@@ -147,6 +150,15 @@ def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> 
         targets,
         places,
     )
+
+
+def _surrounding(stage_set: _TargetDrive, viewpoint: Viewpoint) -> list[PlacedObject]:
+    """Objects around the camera; on an approach without those between it and the target."""
+    placed_objects = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+    if not stage_set.recording.approach:
+        return placed_objects
+    is_between = between(stage_set.targets[0], viewpoint, placed_objects)
+    return [placed for placed, is_hiding in zip(placed_objects, is_between, strict=True) if not is_hiding]
 
 
 def _draw_target(population: SceneObjects, rng: np.random.Generator) -> ObjectBody:
@@ -253,12 +265,7 @@ def _approaching_rounds(
             count=distance_indices.count(index),
             rng=rng,
         )
-        straight = [viewpoint for viewpoint in viewpoints if viewpoint.description["distance"] >= STRAIGHT * distance]
-        sight_free = has_free_sight(stage_set.scene, straight, batch=batch_size(recording.device), height=2 * AIM)
-        free = [viewpoint for viewpoint, is_free in zip(straight, sight_free, strict=True) if is_free]
-        remaining[index] = iter(
-            [replace(viewpoint, description=viewpoint.description | {"distance": distance}) for viewpoint in free]
-        )
+        remaining[index] = _visible_viewpoints(stage_set, viewpoints, distance)
     while True:
         batch = []
         for slot in missing():
@@ -268,6 +275,17 @@ def _approaching_rounds(
         if not batch:
             return
         yield batch
+
+
+def _visible_viewpoints(
+    stage_set: _TargetDrive, viewpoints: Sequence[Viewpoint], distance: float
+) -> Iterator[Viewpoint]:
+    """Those viewpoints of an approach from which the street does not hide the target, described by their distance."""
+    for viewpoint in viewpoints:
+        if viewpoint.description["distance"] < STRAIGHT * distance:
+            continue  # behind a bend
+        if has_free_sight(stage_set.scene, [viewpoint], batch=1, height=2 * AIM)[0]:
+            yield replace(viewpoint, description=viewpoint.description | {"distance": distance})
 
 
 def _record_part(task: tuple[TargetRecording, str, int, int, str]) -> str:
@@ -329,7 +347,7 @@ def _accept_views(
     candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for slot, viewpoint in shots:
         target = stage_set.targets[slot % len(stage_set.targets)]
-        surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        surrounding = _surrounding(stage_set, viewpoint)
         if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
@@ -681,7 +699,7 @@ def recorded_views(
             target_pose = np.array(row["target_pose"])
             weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
-            surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+            surrounding = _surrounding(stage_set, viewpoint)
             view = _view(stage_set, row["slot"], viewpoint, surrounding, _draw_camera(stage_set, row["slot"]))
             yield RecordedView(row["file_name"], row, stage_set.scene, view, objects)
     except (KeyError, TypeError) as error:

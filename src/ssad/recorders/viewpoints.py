@@ -209,6 +209,30 @@ def has_room(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[
     return bool((obb_distance(target_box, boxes) > 0.1).all() and (camera_distance[is_tall] > 0.6).all())
 
 
+def between(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject]) -> Bool:
+    """Return whether each object stands between camera and target, [N]: it would hide some of the target's width."""
+    way = viewpoint.target[:2, 3] - viewpoint.camera[:2, 3]
+    direction = way / np.hypot(*way)
+    length = float(np.hypot(*way)) - target.size[0] / 2
+    if not nearby_objects or length <= 0.0:
+        return np.zeros(len(nearby_objects), np.bool_)
+    corridor = np.array(
+        [
+            *(viewpoint.camera[:2, 3] + 0.5 * length * direction),
+            np.arctan2(direction[1], direction[0]),
+            length,
+            target.size[1],
+        ]
+    )
+    boxes = np.array(
+        [
+            (*placed.pose[:2, 3], np.arctan2(placed.pose[1, 0], placed.pose[0, 0]), *placed.body.size[:2])
+            for placed in nearby_objects
+        ]
+    )
+    return np.asarray(obb_distance(corridor, boxes) <= 0.0)
+
+
 def has_free_sight(scene: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
     """Return whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 

@@ -14,7 +14,8 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, LaneType
 from ssad.rendering.bodies import BODIES, draw_paint, make_body
-from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, class_of
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, class_of, towing_vehicle
+from ssad.rendering.bodies.parts import as_point
 from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
@@ -47,10 +48,17 @@ def _floor() -> Mesh:
 def class_sheet(width: int = 240) -> U8:
     """Render the ten classes, one row for each kind of body."""
     meshes, captions = [_floor()], []
+    towing: dict[int, SceneObject] = {}  # vehicle before a trailer, by the number of the trailer
     for kind in BODY_CATEGORIES:
         for style in SHOWN.get(kind, tuple(BODIES[kind].styles)[:3]):
             meshes.append(make_body(kind, style=style, generator=generator("gallery", kind, style)))
             captions.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
+            if kind == "trailer":
+                lower, upper = meshes[-1].bounds()
+                vehicle = towing_vehicle(style, as_point(upper - lower))
+                body_draws = generator("gallery", vehicle.kind, vehicle.style)
+                meshes.append(make_body(vehicle.kind, style=vehicle.style, size=vehicle.size, generator=body_draws))
+                towing[len(meshes) - 2] = SceneObject(len(meshes) - 1, upright_pose(vehicle.ahead, 0.0, 0.0))
     scene = RenderScene(None, meshes)
     camera = Camera.typical(width * 2, width * 3 // 2)
     views = []
@@ -66,11 +74,12 @@ def class_sheet(width: int = 240) -> U8:
         tilt_rotation = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
         pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ tilt_rotation
         paint = draw_paint(generator("gallery paint", index))
+        vehicles = (towing[mesh_index],) if mesh_index in towing else ()
         views.append(
             View(
                 camera,
                 pose,
-                (SceneObject(0, np.eye(4)), SceneObject(mesh_index, np.eye(4), paint, 1)),
+                (SceneObject(0, np.eye(4)), SceneObject(mesh_index, np.eye(4), paint, 1), *vehicles),
                 SceneWeather(0.8, -1.9, 0.4),
             )
         )

@@ -17,7 +17,7 @@ from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
-from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
+from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, TowingVehicle, plain_body, towing_vehicle
 from ssad.rendering.camera.scene import Finish, SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
@@ -71,6 +71,7 @@ NOTHING = Mesh(
     np.zeros(0, np.int32),
     (),
 )
+TRAILER_GAP = 0.9  # m of the kerb that a trailer and the vehicle before it leave free
 LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
@@ -254,12 +255,19 @@ class SceneObjects:
         self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked, shown))
 
     def make(
-        self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
+        self,
+        kind: str,
+        style: str,
+        size: Size,
+        *,
+        name: tuple[object, ...] = (),
+        phases: int = 1,
+        has_driver: bool = True,
     ) -> tuple[str, str, Size, tuple[int, ...]]:
         """Add the meshes of one body in `phases` phases of its cycle; return its description for `add`."""
         key = (*self.key, *(name or (len(self.meshes),)))
 
-        build = partial(_drawn_mesh, make_body, key, kind, style, size, self.detail)
+        build = partial(_drawn_mesh, make_body, key, kind, style, size, self.detail, has_driver)
         cycle_phases = [2 * np.pi * index / phases if phases > 1 else None for index in range(phases)]
         return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle_phases)
 
@@ -272,10 +280,13 @@ def _drawn_mesh(  # noqa: PLR0917
     style: str,
     size: Size,
     detail: int,
+    has_driver: bool,
     phase: float | None,
 ) -> Mesh:
     # A recording is rendered clean and under each of its perturbations, an episode for each of its drivers.
-    return make(kind, style=style, size=size, generator=generator("record mesh", *key), detail=detail, phase=phase)
+    random_draws = generator("record mesh", *key)
+    options = {"generator": random_draws, "detail": detail, "phase": phase, "has_driver": has_driver}
+    return make(kind, style=style, size=size, **options)
 
 
 class GroundOccupancy:
@@ -467,14 +478,39 @@ def _add_parked_vehicles(  # noqa: PLR0917
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
         lateral_offset = size[1] / 2 + 0.08 if spot_index >= len(parking_lots) else 0.0
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
-        if not clear.is_free(x, y, yaw, PARKED[body_kind][1], size[1]):
+        towing = towing_vehicle(style, size) if body_kind == "trailer" else None
+        room = PARKED[body_kind][1] if towing is None else towing.length + TRAILER_GAP
+        if not clear.is_free(x, y, yaw, room, size[1]):
             continue
-        clear.occupy(x, y, yaw, PARKED[body_kind][1], size[1])
+        clear.occupy(x, y, yaw, room, size[1])
+        if towing is not None:
+            _add_parked_trailer(population, (x, y, yaw, z), style, size, towing)
+            continue
         wrong_way_share = 0.5 if spot_index < len(parking_lots) else AGAINST.get(body_kind, 0.0)
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
-        population.add(population.make(body_kind, style, size), _fixed_track(x, y, facing, z), parked=True)
+        parked_body = population.make(body_kind, style, size, has_driver=False)
+        population.add(parked_body, _fixed_track(x, y, facing, z), parked=True)
         if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
             _add_building_site(population, (x, y, yaw, z), size, prop_rng, clear)
+
+
+def _add_parked_trailer(
+    population: SceneObjects,
+    centre: tuple[float, float, float, float],
+    style: str,
+    size: Size,
+    towing: TowingVehicle,
+) -> None:
+    """Add a trailer with the vehicle before it; both together stand about a place (x, y, yaw, z)."""
+    x, y, yaw, z = centre
+    trailer_offset = 0.5 * (size[0] - towing.length)
+    bodies = (
+        (towing.kind, towing.style, towing.size, trailer_offset + towing.ahead),
+        ("trailer", style, size, trailer_offset),
+    )
+    for kind, body_style, body_size, along in bodies:
+        track = _fixed_track(x + along * np.cos(yaw), y + along * np.sin(yaw), yaw, z)
+        population.add(population.make(kind, body_style, body_size, has_driver=False), track, parked=True)
 
 
 def _add_building_site(

@@ -31,7 +31,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
 from ssad.training.batches import ImageSet, TrainingImage, load_images
-from ssad.training.data import nuscenes_items
+from ssad.training.data import nuscenes_items, photograph_items
 from ssad.training.loop import LAST_CHECKPOINT, LOG, ProcessRank, read_last, read_rows, train, write_row
 from ssad.training.recipe import Recipe, command_line_changes, find_recipe, recipe_data
 
@@ -127,6 +127,43 @@ def coco_items(
     ]
 
 
+def is_recording(folder: Path, split: str) -> bool:
+    """Return whether SSAD recorded a folder, or its annotations have the layout of SSAD's recordings."""
+    annotations = folder / "annotations"
+    return (annotations / "all.json").is_file() or (annotations / f"{split}.json").is_file() or not folder.is_dir()
+
+
+def flat_items(
+    folder: Path, split: str, recipe: Recipe, report: ImportReport | None = None
+) -> tuple[tuple[str, ...], list[TrainingImage]]:
+    """Return classes and images of a split for 2D detectors: of recordings, or of photographs.
+
+    Args:
+        folder: The folder.
+        split: Name of the split.
+        recipe: The recipe, which says the size of photographs.
+        report: Filled with what came in, what is not read, and what is doubtful.
+
+    Raises:
+        ConfigError: The split does not exist.
+    """
+    if is_recording(folder, split):
+        return coco_items(folder, split, report)
+    return photograph_items(folder, split, recipe.photo_size, report)
+
+
+def learned_from(plan: DetectorPlan) -> str:
+    """Return the kind of images that a training learns from, in words, for the card."""
+    is_rendered = {
+        folder: (folder / "annotations" / "all.json").is_file() or (folder / ".parts").is_dir() for folder in plan.data
+    }
+    rendered = ", ".join(folder.name for folder in plan.data if is_rendered[folder])
+    other = ", ".join(folder.name for folder in plan.data if not is_rendered[folder])
+    texts = [f"images that SSAD rendered ({rendered})"] if rendered else []
+    texts += [f"other data ({other})" if other else "no photographs"]
+    return "; ".join(texts)
+
+
 def run_training(plan: DetectorPlan, *, report: Say = print) -> Iterator[str]:
     """Train a detector, and write OUT/NAME.safetensors with its card.
 
@@ -201,7 +238,7 @@ def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: s
 
 def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, report: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
-    sources, options = _items(plan, is_3d=recipe.is_3d, report=report)
+    sources, options = _items(plan, recipe, report=report)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
         unmatched_weights = copy_matching_weights(detector, load_weights(plan.weights), str(plan.weights))
@@ -212,7 +249,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, re
             )
     fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
     checkpoint = read_last(plan.out / LAST_CHECKPOINT, recipe, fingerprint)
-    validate = _validation(plan, device, is_3d=recipe.is_3d)
+    validate = _validation(plan, device, recipe)
     initial_weights = _weights_origin(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
     completed, last_epoch = (
@@ -255,6 +292,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, re
         metrics=metrics,
         classes=tuple(trained.classes),
         config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | initial_weights,
+        learned_from=learned_from(plan),
     )
     save_weights(weights, trained.state_dict(), card=card, half=True)
     draw_curves(plan.out)
@@ -285,18 +323,18 @@ def _card_epochs(weights: Path) -> int:
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
 
-def _items(plan: DetectorPlan, *, is_3d: bool, report: Say = print) -> tuple[list[TrainingImage], dict[str, Any]]:
+def _items(plan: DetectorPlan, recipe: Recipe, *, report: Say = print) -> tuple[list[TrainingImage], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
-    if not is_3d and plan.val_data is not None:
+    if not recipe.is_3d and plan.val_data is not None:
         raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
-    if is_3d:
+    if recipe.is_3d:
         sources = [source for folder in plan.data for source in nuscenes_items(folder, None, plan.split)]
     else:
         sources = []
         for folder in plan.data:
             account = ImportReport(str(folder))
-            class_names, folder_items = coco_items(folder, plan.split, account)
+            class_names, folder_items = flat_items(folder, plan.split, recipe, account)
             if account.omissions or account.doubts:
                 report(account.text(f"data {folder}, split {plan.split}:"))
             if options and options["classes"] != class_names:
@@ -363,9 +401,9 @@ def command_of(plan: DetectorPlan) -> str:
     return shlex.join([*arguments, *command_line_changes(plan.changes)])
 
 
-def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[..., dict[str, float]]:
+def _validation(plan: DetectorPlan, device: str, recipe: Recipe) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
-    if is_3d:
+    if recipe.is_3d:
         root = plan.val_data or plan.data[0]
         with NuScenes(root) as dataset:
             version = dataset.version
@@ -376,24 +414,27 @@ def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[...
             return score_3d(detector, root, version, quick_scenes if quick else scenes, device=device)
 
         return check_3d
-    split = "test" if plan.val == "val" else plan.val
     if len({folder.name for folder in plan.data}) < len(plan.data):
         raise ConfigError("two folders of data have the same name, and metrics are named by it; rename one")
-    for folder in plan.data:
-        if not coco_items(folder, split)[1]:
-            raise ConfigError(f"{folder}: no picture to validate on in annotations/{split}.json")
+    items_by_folder = {folder: flat_items(folder, _val_split(plan, folder), recipe) for folder in plan.data}
+    for folder, (_, folder_items) in items_by_folder.items():
+        if not folder_items:
+            raise ConfigError(f"{folder}: no picture to validate on in annotations/{_val_split(plan, folder)}.json")
     images_by_folder: dict[str, ImageSet] = {}
 
     def check_2d(detector: Any, *, quick: bool) -> dict[str, float]:
         metrics: dict[str, float] = {}
         for folder in plan.data:
+            class_names, folder_items = items_by_folder[folder]
             if folder.name not in images_by_folder:
-                images_by_folder[folder.name] = load_images(coco_items(folder, split)[1], device=device)
+                images_by_folder[folder.name] = load_images(folder_items, device=device)
             image_set = images_by_folder[folder.name]
-            path = folder / "annotations" / f"{split}.json"
-            coco_set = read_coco(path, report=ImportReport(str(path)))
-            scores = score_2d(detector, image_set, classes=coco_set.classes, device=device)
+            scores = score_2d(detector, image_set, classes=class_names, device=device)
             metrics |= {f"{folder.name}_{name}": value for name, value in scores.items()}
+            path = folder / "annotations" / f"{_val_split(plan, folder)}.json"
+            if not path.is_file():  # photographs have no target
+                continue
+            coco_set = read_coco(path, report=ImportReport(str(path)))
             target_set = ImageSet(image_set.pictures, tuple(coco_truth(coco_set, target=True)))
             metrics[f"{folder.name}_target_AP50"] = score_2d(
                 detector, target_set, classes=coco_set.classes, device=device
@@ -401,6 +442,11 @@ def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[...
         return metrics
 
     return check_2d
+
+
+def _val_split(plan: DetectorPlan, folder: Path) -> str:
+    """Return the split of a folder to validate on: recordings call that of the default test."""
+    return "test" if plan.val == "val" and is_recording(folder, "test") else plan.val
 
 
 def draw_curves(out: Path) -> None:

@@ -61,6 +61,8 @@ class Recipe:
         options: Of the detector's builder, such as heading: vectors; `make_detector` needs them again to load the
             weights.
         seed: Of all random draws.
+        photo_size: Height and width to which photographs of COCO, KITTI, BDD100K and nuScenes are fitted, 2D only:
+            resized, and padded with grey at the right and the bottom.
     """
 
     detector: str
@@ -95,6 +97,7 @@ class Recipe:
     attack_steps: Whole = 1
     options: dict[str, Any] = field(default_factory=dict)
     seed: FromNone = 0
+    photo_size: tuple[Whole, Whole] = (384, 640)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

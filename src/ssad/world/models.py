@@ -42,7 +42,7 @@ _SURROGATES = (
     Model("euroncap_vehicle", AgentKind.CAR, 4.023, 1.712, 1.427, 2.475, _STEER, 5.0, 10.0, 70.0),
 )
 SURROGATES = frozenset(m.name for m in _SURROGATES)
-"""Models with the dimensions of Euro NCAP's test devices; imports choose them for no other body."""
+"""Models with the dimensions of Euro NCAP's test devices; imports choose them by name alone."""
 
 MODELS: dict[str, Model] = {
     m.name: m

@@ -112,7 +112,7 @@ def test_facts_of_carla_towns(carla_home: Path) -> None:
     assert np.unique(two.speed_limit[two.kind == LaneType.DRIVING]) == pytest.approx([25 * 0.44704])
     five = imported(carla_home, "Town05")
     assert five.signal_virtual.all()
-    limits = np.unique(five.speed_limit[(five.kind == LaneType.DRIVING) & (five.junction < 0)])
+    limits = np.unique(five.speed_limit[five.kind == LaneType.DRIVING])
     assert limits == pytest.approx(np.array([35, 55, 65]) * 0.44704, rel=1e-5)
     light = imported(carla_home, "Town_Safebench_Light")
     assert light.signal_virtual.all()
@@ -172,43 +172,38 @@ def test_signs_of_a_map_are_known_by_what_they_name(tmp_path: Path) -> None:
         assert np.array_equal(getattr(changed, name), getattr(plain, name)), "signs change nothing that is driven by"
 
 
-def test_traffic_is_slower_across_junctions_without_lights_and_signs(tmp_path: Path) -> None:
-    """Junctions with lights, those with a sign, and the roads between them keep the limits of the map."""
+def test_junctions_without_lights_and_signs_are_controlled_where_it_is_asked_for(
+    tmp_path: Path, ssad_home: Path
+) -> None:
+    """Junctions with lights, those with a sign, and the roads between them stay as the map has them."""
     root = ElementTree.fromstring(SMALL)
     for speed in root.iter("speed"):
         speed.set("max", "100")
         speed.set("unit", "km/h")
     posts = [(road, post) for road in root.findall("road") for post in road.findall("signals/signal[@dynamic='no']")]
-    signed = bake(_map(tmp_path, ElementTree.tostring(root, encoding="unicode")), "signed")
-    assert np.unique(signed.speed_limit) == pytest.approx([100.0 / 3.6])
     sign = min(post.get("id", "") for _, post in posts)
     for road, post in posts:
         if post.get("id") != sign:
             road.find("signals").remove(post)
+    path = _map(tmp_path, ElementTree.tostring(root, encoding="unicode"))
     report = ImportReport("small")
-    graph = bake(_map(tmp_path, ElementTree.tostring(root, encoding="unicode")), "uncontrolled", report=report)
-    with_sign = {int(graph.junction[after]) for lane in graph.rule_lane for after in graph.successors(int(lane))} - {-1}
-    uncontrolled = set(graph.signal_junction[graph.signal_virtual].tolist()) - with_sign
-    assert len(with_sign) == 1
+    plain = load_graph(import_map(path, "small", ssad_home))
+    slow = load_graph(import_map(path, "small", ssad_home, uncontrolled="slow", report=report))
+    lit = load_graph(import_map(path, "small", ssad_home, uncontrolled="signals"))
+    assert np.unique(plain.speed_limit) == pytest.approx([100.0 / 3.6])
+    signed = {int(plain.junction[after]) for lane in plain.rule_lane for after in plain.successors(int(lane))} - {-1}
+    uncontrolled = set(plain.signal_junction[plain.signal_virtual].tolist()) - signed
+    assert len(signed) == 1
     assert len(uncontrolled) == 3
-    across = np.isin(graph.junction, list(uncontrolled)) & (graph.kind == LaneType.DRIVING)
-    assert graph.speed_limit[across] == pytest.approx(50.0 / 3.6)
-    assert graph.speed_limit[~across] == pytest.approx(100.0 / 3.6)
+    across = np.isin(plain.junction, list(uncontrolled)) & (plain.kind == LaneType.DRIVING)
+    assert slow.speed_limit[across] == pytest.approx(50.0 / 3.6)
+    assert slow.speed_limit[~across] == pytest.approx(100.0 / 3.6)
+    assert are_equal(replace(slow, speed_limit=plain.speed_limit), plain)
     assert report.notes["the speed limit across junctions without lights and signs is 50 km/h"] == [
         f"junction {junction}" for junction in sorted(uncontrolled)
     ]
-
-
-def test_lights_are_added_where_they_are_asked_for(tmp_path: Path, ssad_home: Path) -> None:
-    path = _map(tmp_path, SMALL)
-    plain = bake(path, "plain")
-    assert 0 < plain.signal_virtual.sum() < len(plain.signal_virtual)
-    report = ImportReport("small")
-    lit = load_graph(import_map(path, "lit", ssad_home, signals=True, report=report))
-    assert not lit.signal_virtual.any()
-    assert are_equal(replace(lit, name="plain", signal_virtual=plain.signal_virtual), plain)
-    counted = [len(places) for line, places in report.notes.items() if "lights are added" in line]
-    assert counted == [int(plain.signal_virtual.sum())]
+    assert set(lit.signal_junction[lit.signal_virtual].tolist()) == signed
+    assert are_equal(replace(lit, signal_virtual=plain.signal_virtual), slow)
 
 
 def _map(folder: Path, text: str) -> Path:

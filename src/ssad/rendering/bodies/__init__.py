@@ -17,6 +17,7 @@ from ssad.core.seeding import generator as seeded
 from ssad.rendering.bodies import anomalies, cycles, furniture, heavy, machines, people, strollers
 from ssad.rendering.bodies import car as _car
 from ssad.rendering.meshes.mesh import Mesh, Point, Rectangle
+from ssad.world.models import MODELS
 
 DETAILS = (0, 1, 2)
 
@@ -32,11 +33,21 @@ class BodyStyle:
 
 @dataclass(frozen=True, slots=True)
 class BodyKind:
-    """Maker and styles of a kind of body. `phased` bodies move with a phase (rad)."""
+    """Maker and styles of a kind of body.
+
+    `phased` bodies move with a phase (rad); `driven` ones show their driver.
+    """
 
     make: Callable[..., Mesh]
     styles: Mapping[str, BodyStyle]
     phased: bool = False
+    driven: bool = False
+
+
+def _target_style(model: str) -> BodyStyle:
+    """Style of a test target, with the exact size of its model of the world; nobody draws it at random."""
+    target = MODELS[model]
+    return BodyStyle((target.length, target.width, target.height), 0.0, 0.0)
 
 
 BODIES: dict[str, BodyKind] = {
@@ -49,7 +60,9 @@ BODIES: dict[str, BodyKind] = {
             "suv": BodyStyle((4.70, 2.00, 1.76), 0.05, 3.0),
             "van": BodyStyle((5.00, 2.08, 2.05), 0.05, 1.0),
             "pickup": BodyStyle((5.45, 2.07, 1.87), 0.04, 0.7),
+            "global_vehicle_target": _target_style("euroncap_vehicle"),
         },
+        driven=True,
     ),
     "truck": BodyKind(
         heavy.truck,
@@ -89,6 +102,7 @@ BODIES: dict[str, BodyKind] = {
         {
             "ridden": BodyStyle((2.10, 0.80, 1.62), 0.04),
             "parked": BodyStyle((2.08, 0.78, 1.22), 0.04),
+            "motorcyclist_target": _target_style("euroncap_motorcycle"),
         },
     ),
     "bicycle": BodyKind(
@@ -96,6 +110,7 @@ BODIES: dict[str, BodyKind] = {
         {
             "ridden": BodyStyle((1.73, 0.60, 1.72), 0.03),
             "parked": BodyStyle((1.71, 0.60, 1.06), 0.03),
+            "bicyclist_target": _target_style("euroncap_bicycle"),
         },
         phased=True,
     ),
@@ -108,6 +123,8 @@ BODIES: dict[str, BodyKind] = {
             "elderly": BodyStyle((0.70, 0.66, 1.60), 0.05, 0.8),
             "worker": BodyStyle((0.44, 0.66, 1.80), 0.04, 0.4),
             "stroller": BodyStyle((0.80, 0.62, 1.70), 0.05, 0.5),
+            "adult_target": _target_style("euroncap_adult"),
+            "child_target": _target_style("euroncap_child"),
         },
         phased=True,
     ),
@@ -294,6 +311,7 @@ def make_body(
     generator: np.random.Generator,
     detail: int = 2,
     phase: float | None = None,
+    has_driver: bool = True,
 ) -> Mesh:
     """Make the mesh of a kind of road user or furniture (see `BODIES`), base centred on the origin, x forward.
 
@@ -308,6 +326,7 @@ def make_body(
         generator: Source of randomness.
         detail: 2 is full, 0 is for far away; draws and size do not depend on it.
         phase: Place in the cycle of a walker, or angle of a bicycle's crank, rad.
+        has_driver: Whether somebody sits in a car; draws do not depend on it.
 
     Returns:
         The mesh.
@@ -328,7 +347,9 @@ def make_body(
         raise ConfigError(f"{kind}: size {full_size} is not three lengths in [0.01, 100] m")
     if detail not in DETAILS:
         raise ConfigError(f"{kind}: detail {detail} is not one of 0, 1, 2")
-    options = {"phase": phase} if body.phased else {}
+    options: dict[str, object] = {"phase": phase} if body.phased else {}
+    if body.driven:
+        options["has_driver"] = has_driver
     length, width, height = (float(extent) for extent in lengths)
     mesh = body.make(style_name, (length, width, height), generator=generator, detail=detail, **options)
     return _in_atlas(mesh, _atlas(kind, style_name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
@@ -22,11 +23,11 @@ ACTOR_BODIES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "bicycle": ("bicycle", ("ridden",)),
     "walker": ("pedestrian", ("adult",)),
     "cone": ("traffic_cone", ("cone",)),
-    "euroncap_adult": ("pedestrian", ("adult",)),
-    "euroncap_child": ("pedestrian", ("child",)),
-    "euroncap_bicycle": ("bicycle", ("ridden",)),
-    "euroncap_motorcycle": ("motorcycle", ("ridden",)),
-    "euroncap_vehicle": ("car", ("hatchback",)),
+    "euroncap_adult": ("pedestrian", ("adult_target",)),
+    "euroncap_child": ("pedestrian", ("child_target",)),
+    "euroncap_bicycle": ("bicycle", ("bicyclist_target",)),
+    "euroncap_motorcycle": ("motorcycle", ("motorcyclist_target",)),
+    "euroncap_vehicle": ("car", ("global_vehicle_target",)),
 }
 # kind of body -> its category in nuScenes; other kinds are no objects of the detection task
 BODY_CATEGORIES: Final[Mapping[str, str]] = {
@@ -43,8 +44,62 @@ BODY_CATEGORIES: Final[Mapping[str, str]] = {
 }
 
 
+TRACTOR_SIZE: Final = (5.6, 2.5, 3.5)  # m, of a tractor before a trailer
+
 # kinds that 2D detectors learn beside the classes of nuScenes; the others are background to them
 PLAIN_CLASSES: Final = ("stop_sign",)
+
+
+# styles with a category of their own
+STYLE_CATEGORIES: Final[Mapping[tuple[str, str], str]] = {
+    ("bus", "bendy"): "vehicle.bus.bendy",
+    ("pedestrian", "child"): "human.pedestrian.child",
+    ("pedestrian", "child_target"): "human.pedestrian.child",
+    ("pedestrian", "worker"): "human.pedestrian.construction_worker",
+}
+
+
+def category_of(kind: str, style: str) -> str:
+    """Return the nuScenes category of a style of a kind of body.
+
+    Raises:
+        KeyError: The kind has no category.
+    """
+    return STYLE_CATEGORIES.get((kind, style), BODY_CATEGORIES[kind])
+
+
+@dataclass(frozen=True, slots=True)
+class TowingVehicle:
+    """Vehicle before a trailer.
+
+    Attributes:
+        kind: Kind of its body.
+        style: Style of its body.
+        size: Length, width, height, m.
+        ahead: Distance from the middle of the trailer to the middle of the vehicle, m.
+        length: Length of both together, m.
+    """
+
+    kind: str
+    style: str
+    size: Point
+    ahead: float
+    length: float
+
+
+def towing_vehicle(style: str, size: Point) -> TowingVehicle:
+    """Return the vehicle that draws a trailer: a car before a utility trailer, a tractor before others.
+
+    Args:
+        style: Style of the trailer.
+        size: Its length, width, height, m.
+    """
+    if style == "utility":
+        car_size = (4.70, 1.94, 1.52)
+        ahead = 0.5 * (size[0] + car_size[0]) - 0.05  # the coupling lies on the ball
+        return TowingVehicle("car", "estate", car_size, ahead, size[0] + car_size[0] - 0.05)
+    # The trailer rests on the tractor's rear axle.
+    return TowingVehicle("truck", "tractor", TRACTOR_SIZE, 0.5 * size[0] + 1.0, size[0] + 1.0 + 0.5 * TRACTOR_SIZE[0])
 
 
 def class_of(kind: str) -> str:

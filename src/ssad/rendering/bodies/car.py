@@ -197,6 +197,11 @@ PICKUP = replace(
     wheel_width=0.26,
 )
 
+# A car of foam under printed covers: the shape of a small hatchback, without mirrors that stand out.
+GLOBAL_VEHICLE_TARGET = replace(HATCHBACK, body=0.985, wheel_width=0.16, sill=0.10)
+COVER = Material("cover", (0.70, 0.70, 0.69), specular=0.03, gloss=0.15)
+PRINT_GLOSS = 0.15  # of everything that is printed on its covers
+
 STYLES: dict[str, Shell] = {
     "sedan": SEDAN,
     "hatchback": HATCHBACK,
@@ -204,18 +209,22 @@ STYLES: dict[str, Shell] = {
     "suv": SUV,
     "van": VAN,
     "pickup": PICKUP,
+    "global_vehicle_target": GLOBAL_VEHICLE_TARGET,
 }
 
 
 def car(style: str, size: Point, *, generator: np.random.Generator, detail: int, has_driver: bool = True) -> Mesh:
     """Return a car of a style that fills its size (length, width with mirrors, height), m.
 
-    Its interior shows behind the panes; with `has_driver`, the driver does, too.
+    Its interior shows behind the panes; with `has_driver`, the driver does, too. The global vehicle target is a car
+    of foam: nobody drives it, its covers keep their colour, and nothing on them shines.
     """
-    style_shell = STYLES[style]
+    style_shell, is_target = STYLES[style], style == "global_vehicle_target"
     variation = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
     chrome, roof_rails = (float(share) for share in generator.random(2))
     spokes = int(generator.integers(5, 8))
+    if is_target:  # one of them is like the other
+        variation, chrome, roof_rails, spokes = np.zeros(4), 0.5, 0.0, 5
     shell = replace(
         style_shell,
         radius=style_shell.radius * (1.0 + 0.02 * variation[0]),
@@ -238,9 +247,19 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int,
         parts += rear_details(shell, size, body, detail=detail, chrome=chrome)
         parts += front_details(shell, size, body, detail=detail)
         # The share of the roof rails also picks the driver: a car takes the same number of draws with and without.
-        driver = Driver.drawn(roof_rails) if has_driver else None
+        driver = Driver.drawn(roof_rails) if has_driver and not is_target else None
         parts += cabin(shell, size, body, detail=detail, driver=driver)
-    return finish(parts, charts(shell, size), size)
+    mesh = finish(parts, charts(shell, size), size)
+    return _printed(mesh) if is_target else mesh
+
+
+def _printed(mesh: Mesh) -> Mesh:
+    """Return the mesh of a car as printed covers over foam."""
+    materials = tuple(
+        COVER if material.paint else replace(material, gloss=min(material.gloss, PRINT_GLOSS), emission=0.0)
+        for material in mesh.materials
+    )
+    return replace(mesh, materials=materials)
 
 
 def fittings(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: bool, rails: bool) -> list[Mesh]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,12 +31,20 @@ from ssad.rendering.bodies.parts import (
     tubes,
     wheel,
 )
-from ssad.rendering.bodies.people import CLOTHS, draw_appearance, figure, seated_pose, torso_charts
+from ssad.rendering.bodies.people import (
+    CLOTHS,
+    TARGET_APPEARANCE,
+    draw_appearance,
+    figure,
+    seated_pose,
+    torso_charts,
+)
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, loft, merge, ring, sphere, tube
 
 BICYCLES = {"plain": 0.3, "city": 0.3, "racing": 0.2, "delivery": 0.2}  # variants and their shares
 MOTORCYCLES = {"naked": 0.3, "sports": 0.3, "scooter": 0.4}
 BOXED = 0.35  # share of naked motorcycles and scooters with a delivery box behind the rider
+TARGET_HELMET = (0.03, 0.03, 0.032)
 WICKER = Material("wicker", (0.24, 0.14, 0.06), specular=0.02, gloss=0.1)
 # painted parts of a motorcycle, through ovals (x, half width, lowest and highest point), m
 TANK = ((-0.18, 0.09, 0.76, 0.84), (-0.05, 0.15, 0.72, 0.94), (0.14, 0.17, 0.70, 0.98), (0.30, 0.08, 0.76, 0.90))
@@ -82,6 +91,8 @@ def bicycle(
     appearance = draw_appearance(generator, helmet=bool(generator.random() < 0.5), rider=True)
     random_phase, uprightness = generator.uniform(0.0, 2.0 * np.pi), float(generator.random())
     variant = _variant(BICYCLES, float(generator.random()))
+    if style == "bicyclist_target":
+        appearance, variant, uprightness = TARGET_APPEARANCE, "plain", 0.5
     # Drawn before the variant is known, so that the number of draws is fixed.
     uprightness = {"city": 1.0, "racing": 0.0}.get(variant, uprightness)
     crank = float(random_phase if phase is None else phase)
@@ -155,7 +166,7 @@ def bicycle(
         parts.append(crate((x, -0.035, z - 0.04), (x + 0.03, 0.035, z + 0.04), TAIL))
         parts.append(crate((x + 0.03, -0.04, z - 0.045), (x + 0.04, 0.04, z + 0.045), TRIM))
     charts = side_charts("frame", (-0.5 * size[0], -0.1, 0.1 * size[2]), (0.5 * size[0], 0.1, 0.75 * size[2]))
-    if style == "ridden":
+    if style != "parked":
         hand_points = [as_point(grip * [1.0, side, 1.0] + [0.0, 0.0, 0.02]) for side in (1.0, -1.0)]
         trunk_lean = {"city": 0.12, "racing": 0.85}.get(variant, 0.35 + 0.35 * (1.0 - uprightness))
         pose = seated_pose(
@@ -201,6 +212,10 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     appearance = draw_appearance(generator, helmet=True, rider=True, visor=True)
     variant = _variant(MOTORCYCLES, float(generator.random()))
     has_box = bool(generator.random() < BOXED) and variant != "sports"
+    if style == "motorcyclist_target":
+        helmet = replace(appearance.helmet or TARGET_APPEARANCE.shirt, colour=TARGET_HELMET)
+        appearance = replace(TARGET_APPEARANCE, helmet=helmet, visor=True)
+        variant, has_box = "naked", False
     # All random numbers are drawn for every variant, so that their number never depends on it.
     colour = CLOTHS[int(generator.integers(1, len(CLOTHS)))]
     segments = (4, 6, 10)[detail]
@@ -220,7 +235,7 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     if detail:
         parts.append(crates((-0.94, 0.12, 0.80), (-0.90, 0.17, 0.84), BLINKER))
     charts = side_charts("body", (-0.5 * size[0], -0.3, 0.15 * size[2]), (0.5 * size[0], 0.3, 0.9 * size[2]))
-    if style == "ridden":
+    if style != "parked":
         hand_points = [as_point(grip * [1.0, side, 1.0] + [-0.03, 0.0, 0.03]) for side in (1.0, -1.0)]
         foot_points = (
             ((0.24, 0.13, 0.33), (0.24, -0.13, 0.33)) if is_scooter else ((0.02, 0.22, 0.33), (0.02, -0.22, 0.33))
@@ -281,7 +296,9 @@ def _motorbike(segments: int, detail: int, *, fairing: bool) -> tuple[list[Mesh]
     fork_crown = np.array([0.40, 0.0, 0.95])
     side_offset = np.array([0.0, 0.09, 0.0])
     parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, segments))
-    parts.append(tube([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)], 0.04, material=FRAME, segments=segments))
+    parts.append(
+        tube(np.array([fork_crown - [0.04, 0.0, 0.06], (0.24, 0.0, 0.44)]), 0.04, material=FRAME, segments=segments)
+    )
     if detail:
         parts.append(
             tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, segments)

@@ -86,14 +86,15 @@ class Surface:
         low, high = polygons.min(axis=1), polygons.max(axis=1)
         overlaps = (self.cells.min(axis=1) < high[:, None]) & (self.cells.max(axis=1) > low[:, None])
         polygon_index, face_index = np.nonzero(overlaps.all(axis=-1))
+        if not len(face_index):
+            return None
         points, counts = _clip(polygons[polygon_index], counts[polygon_index], self.cells[face_index])
         is_area = _areas(points, counts) > MIN_PIECE
-        points, counts, owner, face_index = (
-            array[is_area] for array in (points, counts, owner[polygon_index], face_index)
-        )
+        points, counts = points[is_area], counts[is_area]
+        owner, face_index = owner[polygon_index][is_area], face_index[is_area]
         shares = _barycentric(points, flat[face_index])
         positions = np.einsum("nkc,ncd->nkd", shares, self.corners[face_index])
-        # Of faces behind one another only the nearest is covered.
+        # Of faces behind one another only the one that is nearest at the middle of the piece is covered.
         middle = points.mean(axis=1)
         middle_shares = _barycentric(np.broadcast_to(middle, (len(flat), len(middle), 2)), flat)
         depths = sign * np.einsum("fnc,fc->fn", middle_shares, self.corners[:, :, axis])
@@ -103,9 +104,8 @@ class Surface:
         is_nearest = sign * positions[..., axis].mean(axis=1) > nearest - BEHIND
         if not is_nearest.any():
             return None
-        positions, counts, shares, owner, face_index = (
-            array[is_nearest] for array in (positions, counts, shares, owner, face_index)
-        )
+        positions, counts, shares = positions[is_nearest], counts[is_nearest], shares[is_nearest]
+        owner, face_index = owner[is_nearest], face_index[is_nearest]
         normals = np.einsum("nkc,ncd->nkd", shares, self.normals[face_index])
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         lifts = np.array([lift for _, _, lift in pieces])

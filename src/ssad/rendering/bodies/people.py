@@ -64,6 +64,18 @@ class PersonAppearance:
     visor: bool = False  # of a motorcycle helmet
 
 
+CHILDREN = ("child", "child_target")
+TARGETS = ("adult_target", "child_target")
+# The colours of the test targets are this project's: dark clothes over blue trousers.
+TARGET_APPEARANCE = PersonAppearance(
+    skin=Material("skin", (0.42, 0.26, 0.18), specular=0.02, gloss=0.1),
+    hair=Material("hair", (0.03, 0.02, 0.015), specular=0.02, gloss=0.1),
+    shirt=Material("shirt", (0.022, 0.022, 0.025), specular=0.02, gloss=0.1),
+    trousers=Material("trousers", (0.03, 0.05, 0.13), specular=0.02, gloss=0.1),
+    shoes=Material("shoes", (0.02, 0.02, 0.022), specular=0.02, gloss=0.1),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class BodyPose:
     """Joints of a person, m. Pairs are (left, right)."""
@@ -410,7 +422,11 @@ def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segme
     if appearance.bands is not None:
         places, *profile = np.array(shirt_rows).T
         edges = [edge for row in BAND_ROWS for edge in (row, row + BAND_WIDTH)]
-        band_rows = [(edge, *(float(np.interp(edge, places, values)) for values in profile)) for edge in edges]
+        half_depths, half_widths = profile
+        band_rows = [
+            (edge, float(np.interp(edge, places, half_depths)), float(np.interp(edge, places, half_widths)))
+            for edge in edges
+        ]
         shirt_rows = sorted({round(row[0], 6): row for row in (*shirt_rows, *band_rows)}.values())
     depth_share = 1.12 if child else 1.0
     angles = np.arange(segments) * (2.0 * np.pi / segments)
@@ -553,13 +569,17 @@ def _facial_features(appearance: PersonAppearance, detail: int) -> Mesh:
     ]
     faces += [(first, first + 1, first + 3), (first, first + 2, first + 1), (first + 1, first + 2, first + 3)]
     material += [4, 4, 4]
-    lips = replace(
-        LIPS,
-        colour=tuple(0.6 * tint + 0.4 * skin for tint, skin in zip(LIPS.colour, appearance.skin.colour, strict=True)),
-    )
-    brows = replace(appearance.hair, name="brows", colour=tuple(0.7 * tint for tint in appearance.hair.colour))
+    lips = replace(LIPS, colour=_mixed(LIPS.colour, appearance.skin.colour, 0.4))
+    brows = replace(appearance.hair, name="brows", colour=_mixed(appearance.hair.colour, (0.0, 0.0, 0.0), 0.3))
     materials = (EYES, lips, WHITES, brows, appearance.skin)
     return build(points, faces, materials=materials, material=material, smooth=0.9)
+
+
+def _mixed(
+    first: tuple[float, float, float], second: tuple[float, float, float], share: float
+) -> tuple[float, float, float]:
+    """Return a colour between two: the share of the second."""
+    return as_point((1.0 - share) * np.array(first) + share * np.array(second))
 
 
 def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, size_share: float) -> list[Mesh]:
@@ -619,7 +639,11 @@ def _extent(pose: BodyPose, height: float) -> F64:
 
 def _pose(style: str, height: float, phase: float, swing: float, spread: float) -> BodyPose:
     """Return one moment of the walking cycle of a style (see `walking_pose`)."""
-    walker = walking_pose(height, phase=phase, swing=swing, spread=spread, child=style == "child")
+    is_child = style in CHILDREN
+    walker = walking_pose(height, phase=phase, swing=swing, spread=spread, child=is_child)
+    if style in TARGETS:  # only the legs of a test target move
+        still = walking_pose(height, phase=0.0, swing=0.0, spread=spread, child=is_child)
+        return replace(walker, elbows=still.elbows, hands=still.hands)
     if style == "elderly":
         walker = stooped_pose(walker, angle=0.32, height=height)
         shoulder = walker.shoulders[1]
@@ -668,6 +692,8 @@ def _dress_for_style(appearance: PersonAppearance, style: str, share: float) -> 
         )
     if style == "stroller":
         return replace(appearance, bag=None)
+    if style in TARGETS:
+        return TARGET_APPEARANCE
     return appearance
 
 
@@ -688,7 +714,7 @@ def pedestrian(
     appearance = draw_appearance(generator)
     random_phase, variation = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
     appearance = _dress_for_style(appearance, style, variation)
-    is_child, is_still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
+    is_child, is_still = style in CHILDREN, style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if is_still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))
 

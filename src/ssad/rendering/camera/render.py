@@ -19,8 +19,8 @@ from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
 from ssad.rendering.camera.kernels import finish as finish_kernels
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
+from ssad.rendering.camera.kernels import puddle, shade, sky
 from ssad.rendering.camera.kernels import sensor as sensing
-from ssad.rendering.camera.kernels import shade, sky
 from ssad.rendering.camera.lamps import (
     LAMP_NEAR,
     LAMP_SHADOWS,
@@ -33,6 +33,7 @@ from ssad.rendering.camera.lamps import (
     struct_array,
     with_low_beams,
 )
+from ssad.rendering.camera.probes import gather_probes, no_probes
 from ssad.rendering.camera.scene import (
     DrawCalls,
     Finish,
@@ -57,6 +58,8 @@ from ssad.rendering.camera.visibility import VisibilityPass, sun_map
 
 FAR = 500.0
 SHADOW_SIZE, SHADOW_REACH = 768, 60.0  # texels, m from the middle to the border
+SOFT_WIDE, SOFT_FINE = (1.5, 2), (1.0, 4)  # texels: smallest filter of soft shadows, and search for occluders
+VISUAL_RANGE = 12_000.0  # m: distance at which haze leaves 2 % of the contrast, as on a clear summer day
 FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
 
@@ -310,6 +313,8 @@ def render(
     size = (views[0].camera.height, views[0].camera.width)
     if any((entry.camera.height, entry.camera.width) != size for entry in views):
         raise ConfigError("views of one call must have one size")
+    # Koschmieder: contrast falls to 2 % over the visual range.
+    haze = 3.912 / VISUAL_RANGE if "haze" in quality.effects else 0.0
     lens, lights, exposures = [], [], []
     for view_index, view in enumerate(views):
         intrinsic = view.camera.intrinsic
@@ -321,7 +326,7 @@ def render(
             raise ConfigError(f"view {view_index}: a camera needs a finite pose and a positive focal length")
         lens.append(kernel_lens(intrinsic))
         view_light, exposure = scene_light(view.weather)
-        lights.append(view_light)
+        lights.append((*view_light, haze))
         exposures.append(exposure)
     views = [_with_effects(entry, quality.effects) for entry in views]
     poses = np.array([entry.pose for entry in views], np.float64)
@@ -342,6 +347,10 @@ def render(
     visible = VisibilityPass(scene, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
     shadows = _sun_shadows(scene, views, bodies, [view_light[0] for view_light in lights], quality)
     nearby_light = _near(scene, views, bodies, quality)
+    if "reflections" in quality.effects:
+        probes = gather_probes(scene, views, lights, shadows=quality.shadows, lamps=quality.lamps)
+    else:
+        probes = no_probes(scene)
     device, shape = scene.device, (len(views), *size)
     layer_tables = _layers(draws, views, scene.device)
     projecting = any(lamp.texture >= 0 for entry in views for lamp in entry.lamps)
@@ -358,23 +367,31 @@ def render(
     output.surface = int(exports_surface)
     for name in SURFACE:
         setattr(output, name, wp.zeros(shape if exports_surface else (1, 1, 1), dtype=wp.vec3, device=device))
+    is_wet = "wet-reflections" in quality.effects and any(view.weather.wet > 0.0 for view in views)
+    output.wet = int(is_wet)
+    for name, dtype in (("mirror", wp.vec4), ("spread", wp.float32), ("source", wp.vec3)):
+        setattr(output, name, wp.empty(shape if is_wet else (1, 1, 1), dtype=dtype, device=device))
     # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
+    to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
     inputs = [
         scene.geometry,
         visible.draw_ranges,
         layer_tables,
         visible.lens,
-        wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
+        to_world,
         wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device),
         shadows,
         nearby_light,
+        probes,
         int(projecting),
         scale,
         lanes,
         output,
     ]
     wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
+    if is_wet:
+        _add_wet_reflections(output, visible.lens, to_world, lanes)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layer_tables.any or projecting:
         count = int(output.found.numpy()[0])
@@ -414,6 +431,21 @@ def _with_effects(view: View, effects: frozenset[str]) -> View:
     if all(not entry.effect or entry.effect in effects for entry in view.objects):
         return view
     return replace(view, objects=tuple(entry for entry in view.objects if not entry.effect or entry.effect in effects))
+
+
+def _add_wet_reflections(output: Any, lens: Any, to_world: Any, lanes: int) -> None:
+    """Add what water on the ground mirrors of the picture itself."""
+    device, (count, height, width) = output.depth.device, output.depth.shape
+    rows = (height + int(puddle.ROWS) - 1) // int(puddle.ROWS)
+    keys = wp.zeros((count, rows, width), dtype=wp.uint64, device=device)
+    inputs = [output.depth, lens, to_world, lanes]
+    wp.launch(puddle.mirror_pixels, dim=(count, rows, lanes), inputs=inputs, outputs=[keys], device=device)
+    sums = wp.zeros((count, rows + 1, width), dtype=wp.vec4, device=device)
+    counts = wp.zeros((count, rows + 1, width), dtype=float, device=device)
+    inputs = [keys, output.source, lanes]
+    wp.launch(puddle.sum_columns, dim=(count, lanes), inputs=inputs, outputs=[sums, counts], device=device)
+    inputs = [output.depth, lens, sums, counts, output.mirror, output.spread, lanes, output.radiance]
+    wp.launch(puddle.add_mirror_image, dim=(count, height, lanes), inputs=inputs, device=device)
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")
@@ -494,13 +526,14 @@ def _sun_shadows(
         if view.focus is not None:
             fine_middles[view_index, :2] = view.focus
     is_up = any(sun[2] > 0.02 for sun in suns)
+    is_soft = "soft-shadows" in quality.effects
+    wide_size = SHADOW_SIZE if quality.shadows and is_up else 0
+    fine_size = FINE_SIZE if quality.shadows and quality.fine and is_up else 0
+    wide_filter, fine_filter = (SOFT_WIDE, SOFT_FINE) if is_soft else ((0.0, 0), (0.0, 0))
     shadows = shade.SunShadows()
-    shadows.wide, shadows.to_wide, shadows.wide_texel = sun_map(
-        scene, bodies, suns, wide_middles, SHADOW_REACH, SHADOW_SIZE if quality.shadows and is_up else 0
-    )
-    shadows.fine, shadows.to_fine, shadows.fine_texel = sun_map(
-        scene, bodies, suns, fine_middles, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and is_up else 0
-    )
+    shadows.soft = int(is_soft)
+    shadows.wide = sun_map(scene, bodies, suns, wide_middles, SHADOW_REACH, wide_size, soft=wide_filter)
+    shadows.fine = sun_map(scene, bodies, suns, fine_middles, FINE_REACH, fine_size, soft=fine_filter)
     return shadows
 
 

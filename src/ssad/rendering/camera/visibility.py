@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.types import F32, F64
-from ssad.rendering.camera.kernels import raster, shade
+from ssad.rendering.camera.kernels import raster, shade, shadow
 from ssad.rendering.camera.scene import DrawCalls, ObjectTable, RenderScene
 
 NEAR = 0.15  # m
@@ -81,21 +81,39 @@ class VisibilityPass:
 
 
 def sun_map(  # noqa: PLR0917
-    scene: RenderScene, bodies: ObjectTable, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
-) -> tuple[Any, Any, float]:
+    scene: RenderScene,
+    bodies: ObjectTable,
+    suns: Sequence[tuple[float, ...]],
+    middles: F64,
+    reach: float,
+    size: int,
+    *,
+    soft: tuple[float, int] = (0.0, 0),
+) -> Any:
     """Render a shadow map [B, size, size] around each middle.
 
+    Args:
+        scene: The scene.
+        bodies: The objects of all views.
+        suns: Direction to the sun of each view.
+        middles: On the map, m.
+        reach: From a middle to the border, m.
+        size: Texels a side; 0 for an empty map.
+        soft: Of soft shadows: smallest radius of the filter, and how far to each side occluders are sought, texels.
+
     Returns:
-        The maps, the matrices from the world to their texels, and the size of a texel, m.
+        A `SunMap` of the kernels.
     """
     middles = middles * [1.0, 1.0, 0.0]
     texel = 2 * reach / max(size, 1)
     to_light = _light_cameras(np.array(suns), middles)
     to_texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
     to_texels[:2, 3] = size / 2
-    matrices = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=scene.device)
+    result = empty_sun_map(scene)
+    result.to_texels = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=scene.device)
+    result.texel = texel
     if not size:
-        return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=scene.device), matrices, texel
+        return result
     image_centre = size / 2 - 0.5
     intrinsics = np.tile(np.array([1 / texel, 1 / texel, image_centre, image_centre], np.float32), (len(middles), 1))
     # Far enough for everything that can cast a shadow into the map; small street objects only near its middle.
@@ -110,7 +128,30 @@ def sun_map(  # noqa: PLR0917
         horizon=False,
         casts_shadows=True,
     )
-    return VisibilityPass(scene, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+    result.keys = VisibilityPass(scene, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples
+    if soft[1] > 0:
+        result.hardest, result.search = soft
+        block = 2 * result.search
+        count = size // block
+        blocks, result.blocks = (
+            wp.empty((len(middles), count, count), dtype=wp.vec2, device=scene.device) for _ in range(2)
+        )
+        lanes = 1 if scene.device == "cpu" else count
+        dim = (len(middles), count, lanes)
+        inputs = [result.keys, block, lanes]
+        wp.launch(shadow.gather_blocks, dim=dim, inputs=inputs, outputs=[blocks], device=scene.device)
+        wp.launch(shadow.join_blocks, dim=dim, inputs=[blocks, lanes], outputs=[result.blocks], device=scene.device)
+    return result
+
+
+def empty_sun_map(scene: RenderScene) -> Any:
+    """Return a shadow map without texels."""
+    result = shadow.SunMap()
+    result.keys = wp.zeros((1, 1, 1), dtype=wp.uint64, device=scene.device)
+    result.blocks = wp.zeros((1, 1, 1), dtype=wp.vec2, device=scene.device)
+    result.to_texels = wp.zeros(1, dtype=wp.mat44, device=scene.device)
+    result.texel, result.hardest, result.search = 1.0, 0.0, 0
+    return result
 
 
 def _light_cameras(suns: F64, middles: F64) -> F64:

@@ -30,6 +30,20 @@ BLUEPRINTS: Final[dict[str, str]] = {
 }
 """Model -> blueprint of CARLA 0.9.16 (its catalogue of vehicles and props)."""
 MODEL_OF: Final[dict[str, str]] = {name: model for model, name in BLUEPRINTS.items() if model not in SURROGATES}
+TARGET_OF: Final[dict[str, str]] = {
+    "ncap_adult": "euroncap_adult",
+    "epta": "euroncap_adult",
+    "ncap_child": "euroncap_child",
+    "eptc": "euroncap_child",
+    "ncap_bicycle": "euroncap_bicycle",
+    "ebta": "euroncap_bicycle",
+    "ncap_motorcycle": "euroncap_motorcycle",
+    "emt": "euroncap_motorcycle",
+    "ncap_globalvehicletarget": "euroncap_vehicle",
+    "gvt": "euroncap_vehicle",
+}
+"""Name of a test target in lower case -> model: the catalogue of vectorgrp/OSC-NCAP-scenarios, and the abbreviations of
+Euro NCAP's protocols."""
 _CATEGORIES: Final[dict[str, tuple[AgentKind, ...]]] = {
     "car": (AgentKind.CAR,),
     "van": (AgentKind.CAR,),

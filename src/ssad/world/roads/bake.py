@@ -7,7 +7,7 @@ import gc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,9 +36,10 @@ WIDE = 100.0  # m; a wider lane is a mistake
 MAX_LANE_METRES = 5.0e6  # of all lanes: bounds the memory of the reader
 LANELET2 = ".osm"  # suffix of Lanelet2 maps
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
-UNCONTROLLED_SPEED = 50.0 / 3.6  # m/s at most across a junction without lights and signs
+UNCONTROLLED_SPEED = 50.0 / 3.6  # m/s, across junctions without lights and signs
 
 Progress = Callable[[str], None]
+Uncontrolled = Literal["keep", "slow", "signals"]
 
 
 @dataclass
@@ -124,7 +125,7 @@ def import_map(
     report: ImportReport | None = None,
     strict: bool = False,
     turn_on_red: bool | None = None,
-    signals: bool = False,
+    uncontrolled: Uncontrolled = "keep",
     progress: Progress | None = None,
     lanelet2: Lanelet2Options | None = None,
 ) -> Path:
@@ -140,7 +141,8 @@ def import_map(
         report: Filled with what came in, what was left out, and what is doubtful.
         strict: Refuse a file with doubts.
         turn_on_red: Turns to the near side are allowed on red; None: as the file suggests.
-        signals: Add traffic lights to the junctions where ways meet and the file has no light.
+        uncontrolled: Junctions where ways meet and the file has neither lights nor signs: `keep` them; `slow` traffic
+            across them to 50 km/h; or do so and add traffic lights (`signals`).
         progress: Called with the name of each stage when it begins.
         lanelet2: Origin, projection and rule of the road of a Lanelet2 map.
 
@@ -167,10 +169,8 @@ def import_map(
         account.refuse_doubts(MapError)
     if turn_on_red is not None:
         graph = replace(graph, turn_on_red=np.array([turn_on_red]))
-    if signals:
-        lights = int(graph.signal_virtual.sum())
-        account.note("traffic lights are added at junctions without one in the file", count=lights)
-        graph = replace(graph, signal_virtual=np.zeros_like(graph.signal_virtual))
+    if uncontrolled != "keep":
+        graph = _control_junctions(graph, account, has_lights=uncontrolled == "signals")
     if progress:
         progress(f"writing town {town_name}")
     source = Path(path).with_suffix(".xodr")
@@ -313,34 +313,40 @@ def _assemble(
         left_hand=np.array([network.left_hand]),
         turn_on_red=np.array([network.turn_on_red]),
     )
-    graph = _slow_across_uncontrolled(graph, report)
     roads = f"{len(network.roads)} roads, {len(network.junctions)} junctions"
     describe(graph, roads, report, lambda lane: _name(graph, lane))
     return graph
 
 
-def _slow_across_uncontrolled(graph: LaneGraph, report: ImportReport) -> LaneGraph:
-    """Return the graph with at most `UNCONTROLLED_SPEED` on the lanes of junctions without lights and signs.
+def _control_junctions(graph: LaneGraph, report: ImportReport, *, has_lights: bool) -> LaneGraph:
+    """Return the graph with at most `UNCONTROLLED_SPEED` across junctions without lights and signs.
 
     Priority to the near side does not work at the speed of a main road: whoever turns across it needs longer than
-    others are in sight, and they cannot stop for it.
+    faster traffic is in sight.
+
+    Args:
+        graph: The town.
+        report: Takes the junctions that change.
+        has_lights: Add traffic lights to these junctions.
     """
-    rule_ends = np.isin(np.repeat(np.arange(graph.lane_count), np.diff(graph.succ_offset)), graph.rule_lane)
-    signed = graph.junction[graph.succ[rule_ends]]
+    leads_from_sign = np.isin(np.repeat(np.arange(graph.lane_count), np.diff(graph.succ_offset)), graph.rule_lane)
+    signed = graph.junction[graph.succ[leads_from_sign]]
     uncontrolled = np.setdiff1d(graph.signal_junction[graph.signal_virtual], signed)
-    is_fast = (
-        np.isin(graph.junction, uncontrolled)
-        & (graph.kind == LaneType.DRIVING)
-        & (graph.speed_limit > np.float32(UNCONTROLLED_SPEED))
-    )
-    if not is_fast.any():
-        return graph
-    for junction in np.unique(graph.junction[is_fast]).tolist():
+    across = np.isin(graph.junction, uncontrolled) & (graph.kind == LaneType.DRIVING)
+    speed_limit = np.minimum(graph.speed_limit, np.float32(UNCONTROLLED_SPEED))
+    for junction in np.unique(graph.junction[across & (speed_limit < graph.speed_limit)]).tolist():
         report.note(
             f"the speed limit across junctions without lights and signs is {UNCONTROLLED_SPEED * 3.6:.0f} km/h",
             f"junction {junction}",
         )
-    return replace(graph, speed_limit=np.where(is_fast, np.float32(UNCONTROLLED_SPEED), graph.speed_limit))
+    if has_lights:
+        for junction in uncontrolled.tolist():
+            report.note("traffic lights are added at junctions without lights and signs", f"junction {junction}")
+    return replace(
+        graph,
+        speed_limit=np.where(across, speed_limit, graph.speed_limit),
+        signal_virtual=graph.signal_virtual & ~(np.isin(graph.signal_junction, uncontrolled) & has_lights),
+    )
 
 
 def _name(graph: LaneGraph, lane: int) -> str:

@@ -180,6 +180,10 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"judges": ["yolov5n"]}, ConfigError, "yolov5n appears twice"),
         ({"grid": {"distances": [1.0]}}, ConfigError, "distances: 3 to 80 m"),
         ({"grid": {"weathers": ["hail"]}}, UnknownNameError, "hail"),
+        ({"approach": {"distances": [5.0, 90.0]}}, ConfigError, "approach: 3 to 80 m"),
+        ({"approach": {"distances": [5.0, 80.0], "size": 320}}, ConfigError, "a car 80 m away needs 431"),
+        ({"attacks": [{"name": "random", "project": True}]}, ConfigError, "project is for a texture"),
+        ({"lights": [{"name": "projector", "settings": {"inks": True}}]}, ConfigError, "light, not print"),
         ({"grid": {"towns": ["Twinford"]}}, ConfigError, "no pair is tested in Twinford"),
         ({"attacks": [{"name": "random", "around": 2}]}, ConfigError, "is not trained"),
         ({"attacks": ["vanish"]}, UnknownNameError, "vanishing"),
@@ -271,6 +275,42 @@ def test_judges_are_shown_what_is_trained_against_others_and_the_grid_is_scored_
         for one in (grid, grid | {"distances": [5.0]})
     )
     assert drive == other, "the pictures from behind do not depend on the grid"
+
+
+def test_an_approach_has_cells_of_its_own_and_textures_are_trained_on_its_distances(tmp_path: Path) -> None:
+    """With `train: false` they are trained from behind, as without an approach, and are others."""
+    approach = {"distances": [5.0, 40.0], "images": 3, "size": 640}
+    given = suite(approach=approach)
+    plan = Physical().plan(given)
+    views = [(cell.fields["view"], cell.fields["attack"]) for cell in plan.cells]
+    attacks = ["clean", "random", "vanishing", "shuffled vanishing"]
+    assert views == [(view, attack) for view in ("drive", "approach") for attack in attacks]
+    recorded = {recording.out.name: recording for recording in given.recordings(tmp_path, "cpu")}
+    assert set(recorded) == {"Oldmarket", "Oldmarket-approach", "Twinford-approach"}
+    assert recorded["Twinford-approach"].images == (("Twinford", 2),)
+    assert recorded["Oldmarket-approach"].images == (("Oldmarket", 3),)
+    assert (recorded["Oldmarket"].size, recorded["Oldmarket"].approach) == (320, ())
+    assert (recorded["Oldmarket-approach"].size, recorded["Oldmarket-approach"].approach) == (640, (5.0, 40.0))
+    specs = [
+        TextureSpec.of_row(Physical().plan(one).cells[2].spec)
+        for one in (given, suite(), suite(approach=approach | {"train": False}), suite(inks=False))
+    ]
+    assert [spec.approach for spec in specs] == [True, False, False, False]
+    assert [spec.inks for spec in specs] == [True, True, True, False]
+    assert specs[1].name == specs[2].name
+    assert len({spec.name for spec in specs}) == 3
+    keys = [{cell.key for cell in Physical().plan(one).cells} for one in (suite(), given)]
+    assert len(keys[0] & keys[1]) == 2, "clean ones and controls from behind do not depend on the approach"
+
+
+def test_a_texture_is_projected_on_request() -> None:
+    shown = {"name": "das", "texture": "das-yolov5n-twinford"}
+    specs = {
+        cell.fields["attack"]: TextureSpec.of_row(cell.spec)
+        for cell in Physical().plan(suite(attacks=[shown, shown | {"project": True}])).cells[1:]
+    }
+    assert [spec.inks for spec in specs.values()] == [False, True]
+    assert list(specs)[1] == "das, project True"
 
 
 def test_a_texture_can_be_trained_from_all_sides_too_and_the_grid_be_of_one_town() -> None:

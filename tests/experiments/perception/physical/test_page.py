@@ -11,11 +11,18 @@ import numpy as np
 import pytest
 from helpers.run_folder import write_lines
 
+from ssad.experiments.perception.physical.approach_page import (
+    approach_figures,
+    approach_table,
+    approach_tables,
+    detection_table,
+)
 from ssad.experiments.perception.physical.page import (
     PhysicalRun,
     comparison_table,
     grid_table,
     main_table,
+    maps,
     margin_table,
     score,
     summary,
@@ -23,6 +30,7 @@ from ssad.experiments.perception.physical.page import (
     transfer_table,
 )
 from ssad.experiments.runs import write_report
+from ssad.metrics.target_approach import stopping_distance
 from ssad.report.figures import HeatMap, heat_maps
 from ssad.report.load import load_run
 from ssad.report.paper import PHYSICAL
@@ -92,6 +100,94 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "run.json").write_text(json.dumps({"kind": "physical", "suite": suite, "cells": []}))
     write_lines(tmp_path, lines)
     return tmp_path
+
+
+def approach(values: dict[float, float], first: float) -> dict[str, Any]:
+    """What a record of the approach has: AP50 by distance, its interval and replicates."""
+    cells = [
+        {
+            "distance": distance,
+            "n": 40,
+            "drives": 8,
+            "height": 30.0,
+            "AP50": ap,
+            "confidence": ap / 2,
+            "found": ap,
+            "intervals": {"AP50": [max(ap - 0.1, 0.0), min(ap + 0.1, 1.0)]},
+            "replicates": {"AP50": [ap - 0.02, ap + 0.02] * 5},
+        }
+        for distance, ap in values.items()
+    ]
+    return {
+        "view": "approach",
+        "approach": cells,
+        "axis": [5.0, 20.0],
+        "first_detected": {"distance": first, "is_end": first == 20.0, "interval": [first - 1.0, first + 1.0]},
+    }
+
+
+@pytest.fixture
+def approached(folder: Path) -> PhysicalRun:
+    """A run with an approach: at 5 m a control hides as much as the attack, at 20 m none, at 60 m the clean is lost."""
+    lines = [
+        line("clean", "", 0.99),
+        line("clean", "", 0.9, **approach({5.0: 0.95, 20.0: 1.0, 60.0: 0.3}, 20.0)),
+        line("random", "camouflage", 0.8, **approach({5.0: 0.4, 20.0: 0.9, 60.0: 0.2}, 20.0)),
+        line("random", "camouflage", 0.8, number=1, **approach({5.0: 0.9, 20.0: 0.8, 60.0: 0.2}, 20.0)),
+        line("vanishing", "camouflage", 0.3, source="yolov5n", **approach({5.0: 0.4, 20.0: 0.1, 60.0: 0.0}, 17.0)),
+    ]
+    write_lines(folder, lines)
+    return PhysicalRun(load_run(folder))
+
+
+def test_scores_stand_against_distance_up_to_where_the_clean_target_is_lost(approached: PhysicalRun) -> None:
+    made = approach_table(approached, "AP50")
+    assert made.columns == ("5 m", "20 m")
+    text = {row.head[2]: [cell.text for cell in row.cells] for row in made.rows}
+    assert text == {
+        "clean": ["95.00", "100.00"],
+        "strongest control, camouflage": ["40.00", "80.00"],
+        "vanishing (strong)": ["40.00", "10.00"],
+    }
+    assert [row.head[3] for row in made.rows] == ["", "", "5 m"], "a control hides as much there"
+    assert made.rows[2].cells[1].interval == "[0.00, 20.00]"
+
+
+def test_the_figure_has_hollow_points_where_nothing_is_proven(approached: PhysicalRun) -> None:
+    ((title, svg),) = approach_figures(approached)
+    assert title == "yolov5n, Oldmarket, camouflage"
+    assert svg.count('fill="var(--card)"') == 2, "at 5 m, of AP50 and of the mean score"
+    assert svg.count("<polygon") == 3, "bands of clean, control and attack"
+    assert "30 km/h" in svg
+    assert "50 km/h" not in svg, "beyond the axis"
+
+
+def test_the_first_detection_stands_beside_what_a_stop_leaves(approached: PhysicalRun) -> None:
+    made = detection_table(approached)
+    rows = {row.head[2]: row for row in made.rows}
+    assert [cell.text for cell in rows["vanishing (strong)"].cells[:2]] == ["17.0", "0.5"]
+    assert rows["vanishing (strong)"].cells[3].mean == pytest.approx(17.0 - stopping_distance(80 / 3.6))
+    assert rows["vanishing (strong)"].head[3] == ""
+    assert rows["clean"].head[3] == "yes", "the axis ends there"
+    assert "random camouflage, draw 2" in rows
+    assert "Regulation 157" in made.note
+
+
+def test_the_page_begins_with_the_distances(approached: PhysicalRun) -> None:
+    page = write_report(approached.run.folder).read_text()
+    assert page.index("Scores against distance") < page.index("Trained in Twinford")
+    assert approach_tables(PhysicalRun(approached.run))[0].name == "approach-ap50"
+
+
+def test_a_map_brackets_cells_in_which_a_control_hides_as_much(folder: Path) -> None:
+    lines = [
+        line("grey", "camouflage", 0.4, **grid(0.3, None)),
+        line("das", "camouflage", 0.4, source="yolov5n", **grid(0.35, [5.0, 0.0, 0.35])),
+    ]
+    write_lines(folder, lines)
+    ((_, svg),) = maps(PhysicalRun(load_run(folder)))
+    assert "(35)" in svg
+    assert "(30)" not in svg
 
 
 def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
@@ -235,12 +331,12 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
     ]
     write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
-    assert row.head[2:] == ("laser, night", "random laser, night")
+    assert row.head[2:] == ("laser, night", "random laser, night", "")
     assert row.cells[2].mean == pytest.approx(90.0 - 70.0)
     lines[0] = line("laser, searches 4", night, 0.70, source="yolov5n")
     write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
-    assert row.head[2:] == ("laser, searches 4, night", "random laser, night")
+    assert row.head[2:] == ("laser, searches 4, night", "random laser, night", "")
 
 
 def test_transfer_and_the_worst_cell(folder: Path) -> None:

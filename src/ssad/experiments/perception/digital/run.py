@@ -90,11 +90,16 @@ class DigitalRun:
 
     @property
     def hardened(self) -> list[tuple[str, str]]:
-        """Detectors with adversarially trained weights, each with its ordinary counterpart ("": none)."""
+        """Detectors with adversarially trained weights, each with its ordinary counterpart ("": none).
+
+        It is the detector with the longest name that says the same before "@", or a part of it: of
+        `fcos3d-light@robust` that is `fcos3d-light@control` before `fcos3d-light`.
+        """
         names = [split_weights(text)[0] for text in self.suite.get("hardened", [])]
         ordinary = sorted((split_weights(text)[0] for text in self.suite["detectors"]), key=len, reverse=True)
         counterparts = (
-            next((counterpart for counterpart in ordinary if name.startswith(counterpart)), "") for name in names
+            next((counterpart for counterpart in ordinary if name.startswith(counterpart.partition("@")[0])), "")
+            for name in names
         )
         return [(_called(name), _called(counterpart)) for name, counterpart in zip(names, counterparts, strict=True)]
 

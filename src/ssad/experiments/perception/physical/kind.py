@@ -177,7 +177,7 @@ class Physical(OpenLoopKind):
         light, view = cell.spec.get("light"), cell.fields["view"]
         pair = (light or cell.spec)["pair"]
         folder = job.folder / "data" / f"{pair['test']}{'' if view == DRIVE else f'-{view}'}"
-        count = job.settings["counts"].get(view, pair["test_images"])
+        count = pair["test_images"] if view == DRIVE else job.settings["counts"][view]
         images = RelightableTargetImages.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
         name = class_of_target(parse_target(job.settings["target"])).replace("_", " ")
         # Far from the target the clean one may be lost: an approach says where.

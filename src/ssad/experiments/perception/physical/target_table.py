@@ -320,7 +320,8 @@ def _texture_rows(  # noqa: PLR0917
     seeds = range(table.seeds) if attack in ("random", "noise", "shuffled") else (0,)
     for source, seed in product(sources, seeds):
         spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
-        spec["approach"] = table.approach is not None and table.approach.train
+        if is_trained and table.approach is not None and table.approach.train:
+            spec["approach"] = True
         spec["source"] = source if is_trained else ""
         fields = {
             "test": pair.test,

@@ -2,18 +2,28 @@
 
 One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with two shadow maps
 (one fine, around the focus), ambient light of sky and ground with contact occlusion, lamps, a mirror term for glass,
-paint and wet roads, fog by distance.
+paint and wet roads, fog and haze by distance.
 """
 
 import warp as wp
 
 from ssad.rendering.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
 from ssad.rendering.camera.kernels.light import CELLS, Near, cell_of, lamp_at, lamp_emission, openness, spot_of
-from ssad.rendering.camera.kernels.matter import Surface, textured
+from ssad.rendering.camera.kernels.matter import GLASS, Surface, textured
+from ssad.rendering.camera.kernels.probe import ROUGH, Probes, mirrored_light
 from ssad.rendering.camera.kernels.raster import LAST, REGISTERS
-from ssad.rendering.camera.kernels.sky import Light, cloudy, sky, surroundings
+from ssad.rendering.camera.kernels.shadow import SunMap, soft_share, sun_share
+from ssad.rendering.camera.kernels.sky import Light, air_transmission, cloudy, sky, surroundings
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+PANES = wp.constant(0.17)  # share of the light that a window with two panes mirrors, seen straight on
+ROOM = wp.constant(0.4)  # share of a window's own colour that remains of it in front of a dark room
+POOL = wp.constant(0.06)  # m above or below the road's level: water there mirrors what stands on the road
+WAVES = wp.constant(0.16)  # rad: blur of the mirror image in the thinnest film of water
+FAINTEST = wp.constant(0.002)  # share of light below which a surface mirrors nothing of a probe
+MIRRORED_TEXTURE = wp.constant(0.35)  # albedo that stands for a texture in mirror images
 
 
 @wp.struct
@@ -54,14 +64,17 @@ class DrawRanges:
 
 @wp.struct
 class SunShadows:
-    """Shadow maps of the sun: one wide, one fine; matrices from the world to texels; m a texel."""
+    """Shadow maps of the sun: one wide, one fine.
 
-    wide: wp.array3d(dtype=wp.uint64)
-    fine: wp.array3d(dtype=wp.uint64)
-    to_wide: wp.array(dtype=wp.mat44)
-    to_fine: wp.array(dtype=wp.mat44)
-    wide_texel: float
-    fine_texel: float
+    Attributes:
+        wide: Reaches far.
+        fine: Lies around the focus.
+        soft: 1 where shadows have a penumbra.
+    """
+
+    wide: SunMap
+    fine: SunMap
+    soft: int
 
 
 @wp.struct
@@ -80,6 +93,10 @@ class Output:
         normal: Unit vectors, world.
         irradiance: Of all light, over pi.
         gain: Gain of the pixel's radiance per unit of albedo.
+        wet: 1 if the following three are exported for the reflections of wet roads, [B, H, W] each.
+        mirror: What the pixel's water mirrors, RGB, and the share that it mirrors.
+        spread: Blur of the mirror image, rad.
+        source: Radiance as water mirrors it, with grey in place of textures.
     """
 
     radiance: wp.array3d(dtype=wp.vec3)
@@ -92,6 +109,10 @@ class Output:
     normal: wp.array3d(dtype=wp.vec3)
     irradiance: wp.array3d(dtype=wp.vec3)
     gain: wp.array3d(dtype=wp.vec3)
+    wet: int
+    mirror: wp.array3d(dtype=wp.vec4)
+    spread: wp.array3d(dtype=float)
+    source: wp.array3d(dtype=wp.vec3)
 
 
 @wp.struct
@@ -138,60 +159,45 @@ class PointLight:
 
 @wp.struct
 class SurfaceLight:
-    """Light that a surface sends to the camera: its colour, and its gain per unit of albedo."""
+    """Light that a surface sends to the camera.
+
+    Attributes:
+        colour: All of it.
+        gain: Gain per unit of albedo.
+        mirror: Part that water on the ground mirrors, RGB, and the share that it mirrors.
+        spread: Blur of the mirror image in that water, rad.
+    """
 
     colour: wp.vec3
     gain: wp.vec3
+    mirror: wp.vec4
+    spread: float
 
 
-@wp.func
-def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
-    """Return 1 if the texel holds nothing nearer to the light, else 0."""
-    if wp.cast(wp.uint32(shadows[view, row, column] >> wp.uint64(32)), float) <= depth:
-        return 1.0
-    return 0.0
-
-
-@wp.func
-def sun_share(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
-    """Return the share of the sun that reaches a point, from four weighted texels of a shadow map.
-
-    p: the point in texels, and in metres along the light. Points outside the map give -1.
-    """
-    size = shadows.shape[1]
-    if size < 4:
-        return -1.0
-    x = p[0] - 0.5
-    y = p[1] - 0.5
-    i = int(wp.floor(x))
-    j = int(wp.floor(y))
-    if i < 0 or j < 0 or i >= size - 1 or j >= size - 1:
-        return -1.0
-    u = x - float(i)
-    v = y - float(j)
-    depth = (1.0e3 - p[2] + bias) * 1.0e-3
-    upper_row = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
-    lower_row = (
-        open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
-    )
-    return upper_row * (1.0 - v) + lower_row * v
-
-
-@wp.func
+@wp.func(inline=True)
 def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
     """Return the share of the sun that reaches a point with a normal, by the fine map if it contains the point."""
-    texel = shadows.fine_texel
-    # The offset along the normal keeps a surface from shading itself.
-    share = sun_share(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
-    if share < 0.0:
-        texel = shadows.wide_texel
-        share = sun_share(shadows.wide, view, wp.transform_point(shadows.to_wide[view], p + n * (texel * 1.5)), texel)
+    if shadows.soft == 1:
+        share = soft_share(shadows.fine, view, p, n)
+        if share < 0.0:
+            share = soft_share(shadows.wide, view, p, n)
+    else:
+        texel = shadows.fine.texel
+        # The offset along the normal keeps a surface from shading itself.
+        share = sun_share(
+            shadows.fine.keys, view, wp.transform_point(shadows.fine.to_texels[view], p + n * (texel * 1.5)), texel
+        )
+        if share < 0.0:
+            texel = shadows.wide.texel
+            share = sun_share(
+                shadows.wide.keys, view, wp.transform_point(shadows.wide.to_texels[view], p + n * (texel * 1.5)), texel
+            )
     if share < 0.0:
         share = 1.0
     return share
 
 
-@wp.func
+@wp.func(inline=True)
 def hit_of(geometry: Geometry, draw_samples: DrawRanges, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
     """Intersect a ray (camera frame, z = 1) with the plane of a slot's face, clamped to its edges."""
     hit = Hit()
@@ -232,7 +238,7 @@ def hit_of(geometry: Geometry, draw_samples: DrawRanges, slot: int, ray: wp.vec3
     return hit
 
 
-@wp.func
+@wp.func(inline=True)
 def light_at(
     light: Light, shadows: SunShadows, near: Near, view: int, row: int, p: wp.vec3, n: wp.vec3, open_: float
 ) -> PointLight:
@@ -256,10 +262,13 @@ def light_at(
     return lit
 
 
-@wp.func
+@wp.func(inline=True)
 def reflected_light(
     light: Light,
     near: Near,
+    probes: Probes,
+    view: int,
+    mirrors_picture: int,
     row: int,
     surface: Surface,
     albedo: wp.vec3,
@@ -268,7 +277,10 @@ def reflected_light(
     lit: PointLight,
     away: wp.vec3,
 ) -> SurfaceLight:
-    """Return the light that a lit surface sends back along a unit ray: its own colour, reflections, and fog."""
+    """Return the light that a lit surface sends back along a unit ray: its own colour, reflections, and fog.
+
+    mirrors_picture: 1 where the mirror image of the picture in water on the ground is added later.
+    """
     result = SurfaceLight()
     n = hit.normal
     p = hit.place
@@ -278,6 +290,8 @@ def reflected_light(
     gloss = surface.gloss
     if surface.paint == 1:
         mirror = 0.05
+    if probes.is_on == 1 and surface.pattern == GLASS:
+        mirror = PANES
     wet = int(0)
     if light.wet > 0.0 and n[2] > 0.9:
         wet = 1
@@ -297,10 +311,21 @@ def reflected_light(
     # Subtracting the first 2 % avoids a step where the mirror term begins.
     mirror_share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
     if mirror_share > 0.0:
-        colour = colour * (1.0 - mirror_share) + surroundings(light, mirror_ray, p, sharpness) * (
-            mirror_share * lit.open_
-        )
+        image = wp.vec3(0.0, 0.0, 0.0)
+        if probes.is_on == 0:
+            image = surroundings(light, mirror_ray, p, sharpness)
+        elif mirror_share > FAINTEST:
+            roughness = 1.0 - gloss
+            if wet == 1 and mirrors_picture == 1:
+                # The mirror image of the picture will replace most of this.
+                roughness = wp.max(roughness, ROUGH)
+            image = mirrored_light(probes, view, mirror_ray, p, roughness)
+        colour = colour * (1.0 - mirror_share) + image * (mirror_share * lit.open_)
         gain = gain * (1.0 - mirror_share)
+        if wet == 1 and wp.abs(p[2]) < POOL:
+            image = image * (mirror_share * lit.open_)
+            result.mirror = wp.vec4(image[0], image[1], image[2], mirror_share)
+            result.spread = WAVES * (1.0 - gloss)
     if gloss > 0.2:
         power = 8.0 + 400.0 * gloss * gloss
         highlight = (mirror + fresnel) * gloss * 6.0
@@ -323,10 +348,16 @@ def reflected_light(
                         if shine > 0.001:
                             irradiance = lamp_at(near.lamps, lamp_index, near.shadows, p, toward, light.fog)
                             colour += near.lamps[lamp_index].light * (irradiance * shine * highlight * 0.5)
-    if light.fog > 0.0:
+    if light.haze > 0.0:
+        clearness = air_transmission(light, hit.distance)
+        colour = wp.cw_mul(colour, clearness) + wp.cw_mul(light.horizon, wp.vec3(1.0, 1.0, 1.0) - clearness)
+        gain = wp.cw_mul(gain, clearness)
+        result.mirror = result.mirror * clearness[1]
+    elif light.fog > 0.0:
         transmission = wp.exp(-light.fog * hit.distance)
         colour = colour * transmission + light.horizon * (1.0 - transmission)
         gain = gain * transmission
+        result.mirror = result.mirror * transmission
     result.colour = colour
     result.gain = gain
     return result
@@ -435,7 +466,7 @@ def list_layer_fragments(
                 remaining = remaining * (1.0 - lookup[2])
 
 
-@wp.func
+@wp.func(inline=True)
 def shade_pixel(
     geometry: Geometry,
     draw_samples: DrawRanges,
@@ -445,6 +476,7 @@ def shade_pixel(
     light: Light,
     shadows: SunShadows,
     near: Near,
+    probes: Probes,
     projecting: int,
     scale: int,
     out: Output,
@@ -454,6 +486,9 @@ def shade_pixel(
 ):
     """Shade one pixel, see `shade`."""
     total = wp.vec3(0.0, 0.0, 0.0)
+    total_mirror = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    hidden_part = wp.vec3(0.0, 0.0, 0.0)
+    spread = float(0.0)
     best = int(0)
     best_tag = int(-1)
     best_depth = float(wp.inf)
@@ -518,10 +553,14 @@ def shade_pixel(
                 if surface.paint == 1:
                     albedo = draw_samples.paints[hit.draw]
                 albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
+                if probes.is_on == 1 and surface.pattern == GLASS:
+                    albedo = albedo * ROOM
+                remaining = float(1.0)
                 if layers.any == 1:
-                    albedo = albedo * remaining_own_colour(
+                    remaining = remaining_own_colour(
                         layers, view, hit.draw, geometry.wearable[hit.face], hit, surface_tag
                     )
+                    albedo = albedo * remaining
                 row = cell_of(hit.place, eye)
                 open_ = float(1.0)
                 if row >= 0:
@@ -537,9 +576,17 @@ def shade_pixel(
                 emission = lamp_emission(
                     surface, draw_samples.lit[hit.draw], side, draw_samples.split[hit.draw], light.lamps
                 )
-                shaded = reflected_light(light, near, row, surface, albedo, emission, hit, lit, away)
+                shaded = reflected_light(
+                    light, near, probes, view, out.wet, row, surface, albedo, emission, hit, lit, away
+                )
                 colour = shaded.colour
                 share = float(covered) / float(count)
+                if out.wet == 1:
+                    if shaded.mirror[3] > 0.0:
+                        total_mirror += shaded.mirror * share
+                        spread = shaded.spread
+                    if layers.any == 1:
+                        hidden_part += shaded.gain * (share * MIRRORED_TEXTURE * (1.0 - remaining))
                 if layers.any == 1 or (projecting == 1 and row >= 0):
                     piece = Fragment()
                     piece.place = (view * out.radiance.shape[1] + y) * out.radiance.shape[2] + x
@@ -577,6 +624,10 @@ def shade_pixel(
     out.radiance[view, y, x] = total / float(count)
     out.tag[view, y, x] = best_tag
     out.depth[view, y, x] = best_depth
+    if out.wet == 1:
+        out.mirror[view, y, x] = total_mirror
+        out.spread[view, y, x] = spread
+        out.source[view, y, x] = total / float(count) + hidden_part
 
 
 @wp.kernel(cuda_max_registers=REGISTERS)
@@ -589,6 +640,7 @@ def shade(
     lights: wp.array(dtype=Light),
     shadows: SunShadows,
     near: Near,
+    probes: Probes,
     projecting: int,
     scale: int,
     lanes: int,
@@ -609,5 +661,19 @@ def shade(
     pose = to_world[view]
     for x in range(lane, out.radiance.shape[2], lanes):
         shade_pixel(
-            geometry, draw_samples, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
-        )  # fmt: skip
+            geometry,
+            draw_samples,
+            layers,
+            focal,
+            pose,
+            light,
+            shadows,
+            near,
+            probes,
+            projecting,
+            scale,
+            out,
+            view,
+            y,
+            x,
+        )

@@ -4,6 +4,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+# Extinction by molecules of air at sea level for red, green and blue, 1/m (Bucholtz, Rayleigh-scattering calculations
+# for the terrestrial atmosphere, Applied Optics 34, 1995; 620, 550 and 460 nm).
+MOLECULES = wp.constant(wp.vec3(7.2e-6, 11.6e-6, 24.2e-6))
+
 
 @wp.struct
 class Light:
@@ -20,6 +24,7 @@ class Light:
         wet: 0 to 1.
         lamps: How far lamps are on, 0 to 1.
         turn: Offset of the clouds.
+        haze: Extinction by haze, 1/m; 0 for air without any haze or molecules.
     """
 
     sun: wp.vec3
@@ -32,6 +37,7 @@ class Light:
     wet: float
     lamps: float
     turn: float
+    haze: float
 
 
 @wp.func
@@ -62,11 +68,14 @@ def cloudy(x: float, y: float) -> float:
 
 @wp.func
 def sky(light: Light, ray: wp.vec3, fine: int) -> wp.vec3:
-    """Return the light from a direction of the sky (unit vector, world)."""
+    """Return the light from a direction of the sky (unit vector, world).
+
+    fine: 0 for the gradient alone, 1 with clouds and the sun, 2 with clouds.
+    """
     up = wp.max(ray[2], 0.0)
     zenith_share = wp.sqrt(up)
     colour = light.horizon * (1.0 - zenith_share) + light.zenith * zenith_share
-    if fine == 1 and ray[2] > 0.0:
+    if fine >= 1 and ray[2] > 0.0:
         # a layer of clouds high above
         cloud_distance = 3.0 / (ray[2] + 0.12)
         x = ray[0] * cloud_distance + light.turn
@@ -76,7 +85,7 @@ def sky(light: Light, ray: wp.vec3, fine: int) -> wp.vec3:
         cloud_colour = light.horizon * 0.9 + light.sun_colour * 0.25
         colour = colour * (1.0 - cloud_share) + cloud_colour * cloud_share
         sun_cosine = wp.dot(ray, light.sun)
-        if sun_cosine > 0.9:
+        if fine == 1 and sun_cosine > 0.9:
             glow = wp.pow(sun_cosine, 64.0) * 0.35 + wp.pow(sun_cosine, 2000.0) * 40.0
             colour = colour + light.sun_colour * glow * (1.0 - 0.9 * light.clouds)
     return colour
@@ -104,3 +113,18 @@ def surroundings(light: Light, ray: wp.vec3, p: wp.vec3, sharp: float) -> wp.vec
     if sky_share > 0.0:
         image = image * (1.0 - sky_share) + sky(light, ray, 0) * sky_share
     return image
+
+
+@wp.func
+def air_transmission(light: Light, distance: float) -> wp.vec3:
+    """Return the share of the light, RGB, that fog and haze leave over a distance in m."""
+    transmission = wp.vec3(1.0, 1.0, 1.0)
+    if light.haze > 0.0:
+        transmission = wp.vec3(
+            wp.exp(-(light.haze + MOLECULES[0]) * distance),
+            wp.exp(-(light.haze + MOLECULES[1]) * distance),
+            wp.exp(-(light.haze + MOLECULES[2]) * distance),
+        )
+    if light.fog > 0.0:
+        transmission = transmission * wp.exp(-light.fog * distance)
+    return transmission

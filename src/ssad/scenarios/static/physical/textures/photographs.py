@@ -152,9 +152,12 @@ def paste(image: U8, colour: Tensor, mask: Bool, quad: F64, *, light: F32) -> U8
     # OpenCV's pixel centres are whole numbers.
     corners = (quad - low) * SAMPLES - 0.5
     transform = cv2.getPerspectiveTransform((texels - 0.5).astype(np.float32), corners.astype(np.float32))
-    warped = cv2.warpPerspective(
-        print_layer, transform, (columns * SAMPLES, rows * SAMPLES), flags=cv2.INTER_LINEAR, borderValue=(0, 0, 0, 0)
-    )
+    size = (columns * SAMPLES, rows * SAMPLES)
+    warped = cv2.warpPerspective(print_layer, transform, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = np.zeros(size[::-1], np.float32)
+    # Corners with 4 fractional bits.
+    cv2.fillConvexPoly(inside, np.rint(corners * 16).astype(np.int32), 1.0, cv2.LINE_8, 4)
+    warped *= inside[..., None]
     averaged = cv2.resize(warped, (columns, rows), interpolation=cv2.INTER_AREA)
     window = np.s_[low[1] : high[1], low[0] : high[0]]
     lit = np.minimum(averaged[..., :3] * light, averaged[..., 3:])
