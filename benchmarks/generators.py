@@ -142,7 +142,34 @@ def page(data: Mapping[str, Any]) -> None:
     made = data["made"]
     weights = ", ".join(f"`{name}` {digest}" for name, digest in made["weights"].items())
     sentence = f"Commit {made['commit']}, torch {made['torch']}, {data['budget']} rollouts, weights {weights}."
-    insert("results/generators.md", "proven", [sentence, "", *table(data)])
+    insert("results/generators.md", "proven", [sentence, "", *table(data), *findings(data)])
+
+
+def findings(data: Mapping[str, Any]) -> list[str]:
+    """Return a line for each system and set: what random search proves, what most, and the most raw collisions.
+
+    A generator proves more than random search only if the interval of the paired difference lies above 0.
+    """
+    lines = []
+    for set_name, systems in data["sets"].items():
+        for system, rows in systems.items():
+            proofs = {name: row["proven"] for name, row in rows.items() if row["proven"] is not None}
+            if RANDOM not in proofs:
+                continue
+            best = max(proofs, key=lambda name: proofs[name]["mean"])
+            raw = max(proofs, key=lambda name: rows[name]["CR_any"]["mean"])
+            better = [
+                f"`{name}`"
+                for name, row in rows.items()
+                if row["less"] is not None and row["less"]["method"] not in ("none", "range") and row["less"]["low"] > 0
+            ]
+            more = f"More than random search, with an interval above 0: {', '.join(better)}." if better else ""
+            lines.append(
+                f"* `{system}` in `{set_name}`: random search proves {text(proofs[RANDOM])} of the bases, `{best}` the "
+                f"most, {text(proofs[best])}. The highest raw CR is that of `{raw}`, {text(rows[raw]['CR_any'])}; it "
+                f"proves {text(proofs[raw])}. {more}".rstrip()
+            )
+    return [*lines, ""] if lines else []
 
 
 def names(given: str) -> list[str]:

@@ -48,8 +48,8 @@ class TargetRecording:
         device: Device that renders.
         streets: See `drive_street`.
         weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
-        approach: Distances of the following camera in place of `behind`, m of way, in turn; empty: `behind` alone.
         randomisation: What is drawn for each image and for each vehicle of a drive.
+        approach: Distances of the following camera in place of `behind`, m of way, in turn; empty: `behind` alone.
 
     Raises:
         ConfigError: A value is out of range, or the values do not fit together.
@@ -71,8 +71,8 @@ class TargetRecording:
     device: str = "cpu"
     streets: str = "town"
     weathers: tuple[str, ...] = ()
-    approach: tuple[float, ...] = ()
     randomisation: Randomisation = NO_RANDOMISATION
+    approach: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for town in (*(name for name, _ in self.images), *self.held_out):
@@ -140,7 +140,8 @@ class TargetRecording:
             "randomisation": self.randomisation.identity(),
         }
         # Empty values are left out, so that recordings without them keep their identity.
-        excluded = {"out", "mode"} | {name for name in ("weathers", "approach", "randomisation") if not settings[name]}
+        optional = ("weathers", "randomisation", "approach")
+        excluded = {"out", "mode"} | {name for name in optional if not settings[name]}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in settings.items()

@@ -79,7 +79,8 @@ def gather_probes(
         else:
             place = tuple(np.floor(view.pose[:2, 3] / SQUARE).astype(int).tolist())
             centre = np.array([*((np.array(place) + 0.5) * SQUARE), HEIGHT])
-        key = (place, light, view.weather.lighting, shadows, lamps)
+        place = (place, view.weather.lighting == UNLIT)
+        key = (place, view.weather.lighting, light, shadows, lamps)
         if key not in known_rows:
             known_rows[key] = len(texels)
             lit_texels = store.texels.pop(key, None) if scene.street is not None else None
@@ -134,6 +135,7 @@ def _probe_views(scene: RenderScene, view: View, centre: F64) -> VisibilityPass:
         axes=poses[:, :3, 2],
         reach=REACH,
         far=far,
+        street_lit=np.full(len(poses), view.weather.lighting != UNLIT),
     )
     half = SIDE / 2
     lens = np.tile(np.array([half, half, half - 0.5, half - 0.5], np.float32), (len(poses), 1))
@@ -152,7 +154,7 @@ def _probe_poses(centre: F64) -> F64:
     for index, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         # columns: right, down, ahead
         poses[index, :3, :3] = np.array([[y, -x, 0], [0, 0, -1], [x, y, 0]], np.float64).T
-    poses[4, :3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], np.float64).T
+    poses[4, :3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float64).T
     return poses
 
 
@@ -178,9 +180,6 @@ def _light_probe(
     size = SUN_SIZE if shadows and is_up else 0
     sun_shadows.wide = sun_map(scene, bodies, [light[0]], centre[None], SUN_REACH, size)
     sun_shadows.fine = empty_sun_map(scene)
-    if scene.street is not None:
-        # The visible faces are kept for other views, whose streets may be lit.
-        visible.draw_ranges.lit.fill_(int(view.weather.lighting != UNLIT))
     count = sum(8 * (SIZE >> level) ** 2 for level in range(int(kernels.LEVELS)))
     texels = wp.empty((1, count), dtype=wp.vec4, device=device)
     lanes = 1 if device == "cpu" else 4 * SIZE

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.rendering.camera.kernels.light import LAMPS_ON, Near, cell_of, lamp_emission
+from ssad.rendering.camera.kernels.light import Near, cell_of, lamp_emission
 from ssad.rendering.camera.kernels.matter import textured
 from ssad.rendering.camera.kernels.probe import direction_of
 from ssad.rendering.camera.kernels.raster import LAST
@@ -62,9 +62,7 @@ def arriving_light(
     albedo = textured(surface, albedo, hit.uv, hit.distance * 2.0 / (float(side) * hit.slant))
     cell = cell_of(hit.place, eye)
     lit = light_at(light, shadows, near, 0, cell, hit.place, hit.normal, 1.0)
-    emission = lamp_emission(
-        surface, draw_samples.lit[hit.draw] & LAMPS_ON, 0.0, draw_samples.split[hit.draw], light.lamps
-    )
+    emission = lamp_emission(surface, draw_samples.lit[hit.draw], 0.0, draw_samples.split[hit.draw], light.lamps)
     colour = wp.cw_mul(albedo, lit.light) + emission
     transmission = air_transmission(light, hit.distance)
     colour = wp.cw_mul(colour, transmission) + wp.cw_mul(light.horizon, wp.vec3(1.0, 1.0, 1.0) - transmission)
