@@ -19,6 +19,7 @@ from ssad.rendering.camera.torch_sensor import ChangedWindow, develop, photosite
 from ssad.rendering.meshes.mesh import Material, build
 
 HAZY = SensorModel(glare=1.0)
+HAZY_PINHOLE = replace(PINHOLE, glare=0.5)
 FLARING = SensorModel(glare=0.5, flare=40.0)
 SIZES = ((40, 56), (45, 37), (5, 4))
 
@@ -152,3 +153,35 @@ def test_settings_out_of_range_are_refused() -> None:
             SensorModel(**settings)
     with pytest.raises(ConfigError, match="need 4 pixels"):
         photosites(torch.zeros(1, 3, 9, 3), replace(PINHOLE, glare=0.1))
+
+
+def test_lit_lamps_glow_at_night_with_the_light_of_their_luminance() -> None:
+    """A lens of a signal and an unlit panel of the same size, by night and by day."""
+    corners = np.array([[0, 0.3, -0.3], [0, -0.3, -0.3], [0, -0.3, 0.3], [0, 0.3, 0.3]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    lens = build(corners, faces, materials=(Material("signal_light", (1.0, 0.004, 0.002), emission=4.0),))
+    panel = build(corners, faces, materials=(Material("door", (1.0, 0.004, 0.002), emission=4.0),))
+    stage = RenderScene(None, [lens, panel])
+    pose = np.eye(4)
+    pose[0, 3] = 20.0
+    camera = Camera.typical(96, 64)
+    for height, glows in ((-0.3, True), (0.8, False)):
+        weather = SceneWeather(height, 2.0, 0.0)
+        views = [
+            View(camera, FORWARD, (SceneObject(mesh, pose),), weather, sensor)
+            for mesh in (0, 1)
+            for sensor in (PINHOLE, HAZY_PINHOLE)
+        ]
+        plain, hazy, unlit, hazy_unlit = render(stage, views).radiance.astype(float)
+        assert (hazy_unlit == unlit).all()
+        if not glows:
+            assert (hazy == plain).all()
+            continue
+        glow = hazy - plain
+        # The lens scatters its shares of the light of 10,500 cd/m^2, less that of the image.
+        shown = plain[plain[..., 0] > 2.0].sum(0)
+        nominal = 4.0 * (np.array([1.0, 0.004, 0.002]) @ [0.2126, 0.7152, 0.0722])
+        gain = 10_500 * np.pi / 60 / nominal - 1.0
+        expected = shown * gain * glare.glare_weights(HAZY_PINHOLE, 64, 96).sum()
+        assert glow.sum((0, 1)) == pytest.approx(expected, rel=0.15)
+        assert glow[32, 60, 0] > 2 * plain[32, 60, 0]

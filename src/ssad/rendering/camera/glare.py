@@ -23,10 +23,12 @@ import warp as wp
 
 from ssad.core.types import F64
 from ssad.rendering.camera.kernels import glare as kernels
-from ssad.rendering.camera.sensor import SMALLEST, SensorModel
+from ssad.rendering.camera.lamps import NIGHT_LUX
+from ssad.rendering.camera.sensor import LUMINANCE, SMALLEST, SensorModel
 
 if TYPE_CHECKING:
     from ssad.rendering.camera.render import View
+    from ssad.rendering.camera.scene import RenderScene
 
 CORE: Final = 0.1  # degrees within which the veil does not rise further
 VEIL: Final = ((10.0, 3.0), (5.0, 2.0))  # factor and exponent of the terms of the veil
@@ -41,6 +43,17 @@ GHOSTS: Final = (
 GHOST_LEVEL: Final = 2  # level of the pyramid to which ghosts are added
 BLOOM: Final = 0.15  # glare of the effect `bloom`: a clean lens behind a clean windscreen
 FLARE: Final = 1.0  # flare of the effect `flare`
+# cd/m^2 at night towards the traffic. Low beams: 400 cd towards oncoming eyes (UN R112, point B50L) from 0.02 m^2; tail
+# lamps: 8 cd (UN R7: 4 to 17) from 0.015 m^2; luminaires: 2,000 cd from 0.1 m^2; signals: 400 cd (EN 12368, level 3)
+# from a lens of 0.11 m.
+LUMINANCES: Final = {
+    "head_lamp": 20_000.0,
+    "tail_lamp": 530.0,
+    "lamp_light": 20_000.0,
+    "street_light": 20_000.0,
+    "signal_light": 10_500.0,
+}
+LIT: Final = 0.3  # share of a lamp's light in an image from which it counts as lit
 SUN_RADIUS: Final = math.radians(0.2666)  # rad
 
 
@@ -155,9 +168,30 @@ def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
     """
     if not any(sensor.scatters for sensor in sensors):
         return radiance
+    weights = _weights_of(radiance, sensors)
+    scattered = _scattered(radiance, sensors, weights)
+    shares = [
+        direct_share(sensor, values) if sensor.scatters else 1.0
+        for sensor, values in zip(sensors, weights, strict=True)
+    ]
+    direct = wp.array(np.array(shares, np.float32), dtype=float, device=radiance.device)
+    out = wp.empty(radiance.shape, dtype=wp.vec3, device=radiance.device)
+    wp.launch(
+        kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=radiance.device
+    )
+    return out
+
+
+def _weights_of(radiance: Any, sensors: Sequence[SensorModel]) -> F64:
+    """Return the weights of the levels of the pyramid of each image [B, levels]."""
+    height, width = radiance.shape[1:]
+    return np.array([glare_weights(sensor, height, width) for sensor in sensors])
+
+
+def _scattered(radiance: Any, sensors: Sequence[SensorModel], weights: F64) -> Any:
+    """Return the light that lenses scatter and mirror, at half the size of the image."""
     device, (count, height, width) = radiance.device, radiance.shape
     levels = level_count(height, width)
-    weights = np.array([glare_weights(sensor, height, width) for sensor in sensors])
     pyramid = [radiance]
     for row_weights, column_weights in zip(
         pyramid_weights(height, levels), pyramid_weights(width, levels), strict=True
@@ -187,14 +221,7 @@ def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
             ]
             wp.launch(kernels.add_ghosts, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
         scattered = total
-    shares = [
-        direct_share(sensor, values) if sensor.scatters else 1.0
-        for sensor, values in zip(sensors, weights, strict=True)
-    ]
-    direct = wp.array(np.array(shares, np.float32), dtype=float, device=device)
-    out = wp.empty(radiance.shape, dtype=wp.vec3, device=device)
-    wp.launch(kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=device)
-    return out
+    return scattered
 
 
 def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: Sequence[tuple[Any, ...]]) -> None:
@@ -230,3 +257,65 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
         wp.launch(
             kernels.add_sun, dim=(len(views), side, side), inputs=[discs, tag, side, radiance], device=radiance.device
         )
+
+
+def lamp_gains(scene: RenderScene) -> F64:
+    """Return the light that the lamps of a scene have at night beyond that of an image, and the least of a lit one.
+
+    Args:
+        scene: Street and bodies.
+
+    Returns:
+        [materials, 2]: additional share of light, and luminance in an image above which a lamp is lit; 0 for other
+        materials.
+    """
+    gains = np.zeros((len(scene.material_names), 2))
+    surfaces = scene.surfaces.numpy()
+    for row, name in enumerate(scene.material_names):
+        if name in LUMINANCES:
+            nominal = float(surfaces["colour"][row] @ LUMINANCE) * float(
+                surfaces["emission"][row] + surfaces["night"][row]
+            )
+            if nominal > 0.0:
+                # A surface of 1 cd/m^2 is as bright as white under pi lux.
+                gains[row] = max(LUMINANCES[name] * math.pi * NIGHT_LUX / nominal - 1.0, 0.0), LIT * nominal
+    return gains
+
+
+def add_glow(
+    radiance: Any, material: Any, scene: RenderScene, views: Sequence[View], lights: Sequence[tuple[Any, ...]]
+) -> None:
+    """Add the glow of lamps to the radiance of views at night whose sensor scatters.
+
+    Images show lamps far darker than they are, so that their colours do not drown. Their glow has the light of their
+    luminance.
+
+    Args:
+        radiance: Linear [B, H, W], a Warp array of vec3; changed in place.
+        material: Row of the material of each pixel [B, H, W], a Warp array; -1 for the sky.
+        scene: Street and bodies.
+        views: The views.
+        lights: Light of each view, see `ssad.rendering.camera.kernels.sky.Light`.
+    """
+    sensors = [view.sensor for view in views]
+    lamps = np.array([light[8] if sensor.scatters else 0.0 for sensor, light in zip(sensors, lights, strict=True)])
+    gains = scene.compute_once(
+        "lamp gains", lambda: wp.array(lamp_gains(scene).astype(np.float32), dtype=float, device=scene.device)
+    )
+    source = wp.empty_like(radiance)
+    lamp_shares = wp.array(lamps.astype(np.float32), dtype=float, device=scene.device)
+    inputs = [radiance, material, gains, lamp_shares]
+    wp.launch(kernels.take_lamps, dim=source.shape[:2], inputs=inputs, outputs=[source], device=scene.device)
+    scattered = _scattered(source, sensors, _weights_of(source, sensors))
+    wp.launch(
+        kernels.add_enlarged,
+        dim=source.shape[:2],
+        inputs=[scattered, lamp_shares],
+        outputs=[radiance],
+        device=scene.device,
+    )
+
+
+def has_glow(views: Sequence[View], lights: Sequence[tuple[Any, ...]]) -> bool:
+    """Return whether lamps glow in one of the views: it is night, and a lens scatters."""
+    return any(view.sensor.scatters and light[8] > 0.0 for view, light in zip(views, lights, strict=True))

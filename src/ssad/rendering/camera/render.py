@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, check_effects
-from ssad.rendering.camera.glare import add_suns, scatter, with_lens_effects
+from ssad.rendering.camera.glare import add_glow, add_suns, has_glow, scatter, with_lens_effects
 from ssad.rendering.camera.kernels import finish as finish_kernels
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import materials as material_kernels
@@ -403,7 +403,8 @@ def render(
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
     material = None
-    if materials or finishes is not None:
+    glows = has_glow(views, lights)
+    if materials or glows or finishes is not None:
         found_materials = wp.empty(shape, dtype=int, device=device)
         inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
@@ -413,6 +414,8 @@ def render(
         surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
         inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
         wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
+    if glows:
+        add_glow(output.radiance, found_materials, scene, views, lights)
     add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)

@@ -143,6 +143,36 @@ def mix(
             out[view, y, x] = radiance[view, y, x]
 
 
+@wp.kernel
+def take_lamps(
+    radiance: wp.array3d(dtype=wp.vec3),
+    material: wp.array3d(dtype=int),
+    gains: wp.array2d(dtype=float),
+    lamps: wp.array(dtype=float),
+    out: wp.array3d(dtype=wp.vec3),
+):
+    """Compute the light that lamps have beyond that of the image; gains: see `lamp_gains`; lamps [B]: 0 by day."""
+    view, row = wp.tid()
+    for column in range(out.shape[2]):
+        source = wp.vec3(0.0, 0.0, 0.0)
+        index = material[view, row, column]
+        if lamps[view] > 0.0 and index >= 0:
+            if gains[index, 0] > 0.0:
+                light = radiance[view, row, column]
+                if 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2] > gains[index, 1] * lamps[view]:
+                    source = light * (gains[index, 0] * lamps[view])
+        out[view, row, column] = source
+
+
+@wp.kernel
+def add_enlarged(scattered: wp.array3d(dtype=wp.vec3), lamps: wp.array(dtype=float), out: wp.array3d(dtype=wp.vec3)):
+    """Add light of half the size to the views in which lamps are on."""
+    view, row = wp.tid()
+    if lamps[view] > 0.0:
+        for column in range(out.shape[2]):
+            out[view, row, column] = out[view, row, column] + enlarged(scattered, view, row, column)
+
+
 @wp.struct
 class SunDisc:
     """Disc of the sun in an image.
