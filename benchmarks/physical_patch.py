@@ -41,7 +41,7 @@ from ssad.scenarios.static.physical.textures.printing import NOMINAL
 RESULTS = Path(__file__).parent / "results" / "physical_patch.json"
 WINDOW, EPOCHS, BATCH = 192, 30, 16
 ALONE = 5  # pictures that have a patch of their own
-FREE = {"expectation": NOMINAL, "smooth": 0.0, "printed": 0.0}  # nothing but the detector's loss
+FREE = {"expectation": NOMINAL, "smooth": 0.0, "inks": False, "printed": 0.0}  # nothing but the detector's loss
 METRICS = ("AP50", "found_25", "confidence")
 
 

@@ -19,7 +19,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.checkpoints import WeightsCard, read_card
 from ssad.core.errors import ConfigError
-from ssad.experiments.perception.digital.run import DigitalRun
+from ssad.experiments.perception.digital.run import DigitalRun, load_digital_run
 from ssad.experiments.perception.digital.tables import hardened_table
 from ssad.report.load import load_run
 from ssad.report.tables import to_markdown
@@ -80,11 +80,15 @@ def attack(recipe: str, out: Path, device: str, settings: list[str]) -> None:
 
 
 def page(out: Path) -> str:
-    """Return the page: what the arms have in common, and the table of both."""
+    """Return the page of a finished comparison."""
     recipe = next((out / CONTROL).glob("*.safetensors")).stem
-    cards = [read_card(out / arm / f"{recipe}.safetensors") for arm in (CONTROL, ROBUST)]
-    shared = check_fairness(*cards)
-    run = load_run(out / "attacks")
+    control, robust = (read_card(out / arm / f"{recipe}.safetensors") for arm in (CONTROL, ROBUST))
+    return page_text(control, robust, load_digital_run(load_run(out / "attacks")))
+
+
+def page_text(control: WeightsCard, robust: WeightsCard, run: DigitalRun) -> str:
+    """Return the page: what the arms have in common, and the table of both."""
+    shared = check_fairness(control, robust)
     first = shared["first_weights"]
     origin = f"`{first['file']}`" + (f" ({first['hash'][:12]})" if "hash" in first else "")
     lines = [
@@ -95,9 +99,9 @@ def page(out: Path) -> str:
         f"{shared['radius']:g} code values before it learned from it; the control, which is the ordinary one of the "
         "table, did not. So the difference is due to the attacks alone.",
         "",
-        f"Commands: `{cards[0].command}`, `{cards[1].command}`, `{run.command}`.",
+        f"Commands: `{control.command}`, `{robust.command}`, `{run.run.command}`.",
         "",
-        to_markdown(hardened_table(DigitalRun(run))).strip(),
+        to_markdown(hardened_table(run)).strip(),
         "",
     ]
     return "\n".join(lines)

@@ -18,6 +18,7 @@ from ssad.experiments.perception.physical.page import PhysicalRun, lower, margin
 from ssad.rendering.target import class_of_target, parse_target
 from ssad.report.load import load_run
 from ssad.scenarios.static.physical.textures.card import SHIPPED, TextureCard, save_texture
+from ssad.scenarios.static.physical.textures.inks import CHARACTERISATION
 
 METRICS = ("AP50", "AP50_25", "ASR_25", "n0_25", "ASR_50", "n0_50")
 
@@ -41,6 +42,9 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         spec, pair, around = line["spec"], line["spec"]["pair"], line["spec"]["around"]
         sort = class_of_target(parse_target(suite["target"]))
         place = f"{suite['behind']:g} m behind" if sort == "car" else f"of a {sort.replace('_', ' ')}"
+        if spec.get("approach"):
+            distances = suite["approach"]["distances"]
+            place = f"{min(distances):g} to {max(distances):g} m {'behind' if sort == 'car' else place}"
         data = (
             f"{pair['train_images']} pictures of drives in {pair['train']}, {place}"
             f"{f', and {around} from all around' if around else ''}; metrics: "
@@ -57,6 +61,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             run.command,
             int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
+            inks=CHARACTERISATION if spec.get("inks") else "",
         )
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"

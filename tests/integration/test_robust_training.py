@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from benchmarks.robust_training import CONTROL, ROBUST, arms, check_fairness, main
+from benchmarks.robust_training import CONTROL, ROBUST, arms, check_fairness, main, page_text
 from ssad.core.checkpoints import WeightsCard, read_card
 from ssad.core.errors import ConfigError
 from ssad.detectors import SHIPPED
-from ssad.experiments.perception.digital.run import DigitalRun
+from ssad.experiments.perception.digital.run import DigitalRun, Setting
 from ssad.report.load import Run
 
 CONFIG = {"epochs_done": 3, "batch": 8, "lr": 6e-4, "first_weights": {"file": "w.safetensors", "hash": "ab" * 32}}
@@ -62,6 +62,24 @@ def test_robust_weights_stand_beside_the_control_rather_than_the_shipped_ones(tm
     suite = {"name": "t", "detectors": names, "hardened": ["fcos3d-light@robust=r.safetensors", "yolov5n"]}
     run = DigitalRun(Run(tmp_path, {"suite": suite}, (), {}, 0), {})
     assert run.hardened == [("robust", "control"), ("yolov5n", "")]
+
+
+def test_the_page_says_the_start_and_sets_robust_weights_beside_the_control() -> None:
+    suite = {"name": "t", "detectors": ["fcos3d-light@control=c.safetensors"], "hardened": ["fcos3d-light@robust=r"]}
+    settings = Setting(), Setting("pgd", "margin", "linf", 5.0, 10)
+    scores = {("control", 0): 0.40, ("control", 1): 0.02, ("robust", 0): 0.37, ("robust", 1): 0.15}
+    records = {
+        (name, settings[number]): {"status": "ok", "metrics": {"mAP": score}, "n": 8, "scenes": 2, "steps": 10}
+        for (name, number), score in scores.items()
+    }
+    run = DigitalRun(Run(Path(), {"suite": suite, "command": "ssad run digital"}, (), {}, 0), records)
+    text = page_text(card(), card(radius=2.0), run)
+    assert "`w.safetensors` (abababababab) for 3 epochs" in text
+    rows = [line for line in text.splitlines() if line.startswith("| robust")]
+    assert [line.split("|")[-4:-1] for line in rows] == [
+        [" 40.00 ", " 37.00 ", " -3.00 "],
+        [" 2.00 ", " 15.00 ", " 13.00 "],
+    ]
 
 
 @pytest.mark.slow  # two trainings and attacks on both

@@ -11,7 +11,7 @@ import pytest
 from helpers.metric_traces import make_trace, straight
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import EpisodeTrace
+from ssad.core.types import AgentKind, EpisodeTrace
 from ssad.metrics.proven_collisions import (
     Accelerations,
     lane_directions,
@@ -172,5 +172,9 @@ def test_contacts_after_the_collision_or_from_the_start_do_not_count() -> None:
     assert touches_others(trace, 1)
     assert touches_others(trace, 1, until=17)
     assert not touches_others(trace, 1, until=15)
+    walkers = dataclasses.replace(
+        trace, kind=np.array([AgentKind.CAR, AgentKind.WALKER, AgentKind.WALKER], trace.kind.dtype)
+    )
+    assert not touches_others(walkers, 1)  # those of a group walk shoulder to shoulder
     beside = make_trace(STEPS, [ego, straight(0.0, 0.0, 0.0, 0.0, STEPS), straight(3.0, 0.0, 0.0, 0.0, STEPS)])
     assert not touches_others(beside, 1)

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -29,6 +30,7 @@ from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
 from ssad.core.types import F64, EpisodeTrace
 from ssad.experiments.perception.physical.target_views import solid_target, target_truth
+from ssad.recorders import target_images
 from ssad.recorders.drives import make_drive
 from ssad.recorders.nuscenes import drive_with_autopilot
 from ssad.recorders.target_images import (
@@ -177,6 +179,30 @@ def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: EpisodeTr
         assert row["way"] == pytest.approx(way[step], abs=0.1)
         behind = [np.interp(way[step] - 20.0, way, xy[:, k]) for k in (0, 1)]
         assert np.hypot(*(np.array(row["pose"])[:2, 3] - behind)) < 0.15
+
+
+def test_an_approach_sees_each_distance_in_turn_and_no_bends(
+    market: EpisodeTrace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every image that is missing is proposed from the distance that falls to it, again and again."""
+    monkeypatch.setattr(target_images, "has_free_sight", lambda *given, **options: np.ones(1, bool))
+    recording = todo(tmp_path, "drive", approach=(5.0, 15.0, 30.0), size=640)
+    drive = SimpleNamespace(recording=recording, trace=market, key=(0,), scene=None)
+    slots, taken = range(25, 34), {0, 4}
+    rounds = target_images._approaching_rounds(
+        drive, "Oldmarket", slots, lambda: [k for k in range(9) if k not in taken], np.random.default_rng(0)
+    )
+    first, second = next(rounds), next(rounds)
+    assert [slot for slot, _ in first] == [k for k in range(9) if k not in taken]
+    distances = {slot: viewpoint.description["distance"] for slot, viewpoint in first}
+    assert set(distances.values()) <= {5.0, 15.0, 30.0}
+    assert len(set(distances.values())) == 3
+    for slot, viewpoint in [*first, *second]:
+        distance = distances[slot]
+        assert viewpoint.description["distance"] == distance
+        apart = np.linalg.norm(viewpoint.camera[:2, 3] - viewpoint.target[:2, 3])
+        assert 0.94 * distance < apart < 1.01 * distance
+    assert [shot.time for _, shot in first] != [shot.time for _, shot in second], "other moments"
 
 
 @pytest.mark.slow

@@ -5,7 +5,23 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 
-from ssad.report.figures import CurvePoint, Interval, MetricChange, Panel, change_plot, element, interval_plot, panels
+from ssad.report.figures import (
+    CURVE_HEIGHT,
+    CURVE_LEFT,
+    CURVE_TOP,
+    CURVE_WIDTH,
+    Curve,
+    CurvePlot,
+    CurvePoint,
+    Interval,
+    MetricChange,
+    Panel,
+    change_plot,
+    curve_plots,
+    element,
+    interval_plot,
+    panels,
+)
 from ssad.report.tables import TableCell
 
 RANGE = TableCell(0.5, 0.25, 0.75, method="range")
@@ -64,3 +80,18 @@ def test_crowded_points_have_no_names_but_tips() -> None:
     (name,) = (text for text in figure.iter("text") if text.text == "highest")
     assert float(name.attrib["y"]) > 12, "the name is inside of the figure, which begins at 0"
     assert change_plot([], {}, label="l", x_title="x", y_title="y") == ""
+
+
+def test_curves_stand_where_their_numbers_are() -> None:
+    """Half way along the axis and up it; a hollow point has the colour of the page, a mark a line of its own."""
+    middle_cell = TableCell(50.0, 25.0, 75.0)
+    points = [CurvePoint(0.0, TableCell(0.0), "5 m"), CurvePoint(0.5, middle_cell, "20 m", is_hollow=True)]
+    plot = CurvePlot("AP50, %", [(0.0, "5"), (1.0, "80")], [Curve("clean", points, "red")], [(0.25, "30 km/h")])
+    svg = curve_plots([plot, plot], label="two", axis="distance, m")
+    left, middle, bottom = CURVE_LEFT + CURVE_WIDTH / 2, CURVE_TOP + CURVE_HEIGHT / 2, CURVE_TOP + CURVE_HEIGHT
+    assert f'points="{CURVE_LEFT:.1f},{bottom:.1f} {left:.1f},{middle:.1f}"' in svg
+    assert f'cx="{left:.1f}" cy="{middle:.1f}" r="4" fill="var(--card)" stroke="red"' in svg
+    assert svg.count("30 km/h") == 2
+    assert svg.count(">clean<") == 1, "one legend"
+    band = CURVE_TOP + CURVE_HEIGHT * 0.25
+    assert f'points="{left:.1f},{band:.1f} {left:.1f},{CURVE_TOP + CURVE_HEIGHT * 0.75:.1f}"' in svg

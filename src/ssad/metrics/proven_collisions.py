@@ -225,6 +225,8 @@ def lane_directions(graph: LaneGraph, xy: npt.ArrayLike) -> tuple[I32, F64]:
 def touches_others(trace: EpisodeTrace, agent: int, *, until: int | None = None, boxes: F64 | None = None) -> bool:
     """Return True if an agent touches another one, not the ego, that it did not touch from the start.
 
+    Walkers who brush against each other do not count: those of a group walk shoulder to shoulder.
+
     Args:
         trace: The trace.
         agent: The agent.
@@ -235,6 +237,8 @@ def touches_others(trace: EpisodeTrace, agent: int, *, until: int | None = None,
     box = (trace_boxes(trace) if boxes is None else boxes)[:end]
     reach = 0.5 * np.hypot(trace.length, trace.width)
     for other_agent in range(1, len(trace.kind)):
+        if trace.kind[agent] == trace.kind[other_agent] == AgentKind.WALKER:
+            continue
         both_present = trace.active[:end, agent] & trace.active[:end, other_agent]
         centre_distance = np.hypot(*(box[:, agent, :2] - box[:, other_agent, :2]).T)
         # The circle test is cheap and excludes nearly all rows before the exact box distance.

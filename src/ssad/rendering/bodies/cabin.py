@@ -32,14 +32,14 @@ LAYER = 0.003  # m between two layers on a pane
 
 
 @dataclass(frozen=True, slots=True)
-class Driver:
+class DriverColours:
     """Colours of a driver as they look through a pane."""
 
     skin: Material
     shirt: Material
 
     @classmethod
-    def drawn(cls, share: float) -> Driver:
+    def drawn(cls, share: float) -> DriverColours:
         """Return the driver for a random share in [0, 1)."""
         skin = SKIN_TINTS[int(share * 1e3) % len(SKIN_TINTS)]
         shirt = SHIRT_TINTS[int(share * 1e4) % len(SHIRT_TINTS)]
@@ -67,7 +67,7 @@ class _Pane:
         return trapezoid((-base, self.up(low)), (base, self.up(high)), (-top, top))
 
 
-def cabin(shell: Shell, size: Point, body: Mesh, *, detail: int, driver: Driver | None) -> list[Mesh]:
+def cabin(shell: Shell, size: Point, body: Mesh, *, detail: int, driver: DriverColours | None) -> list[Mesh]:
     """Return what shows behind the panes of a car.
 
     Args:
@@ -87,63 +87,71 @@ def cabin(shell: Shell, size: Point, body: Mesh, *, detail: int, driver: Driver 
 
 
 def _pane(surface: Surface) -> _Pane | None:
-    points = surface.corners.reshape(-1, 3)
-    if not len(points):
+    pane_points = surface.corners.reshape(-1, 3)
+    if not len(pane_points):
         return None
-    heights, widths = points[:, 2], np.abs(points[:, 1])
+    heights, half_widths = pane_points[:, 2], np.abs(pane_points[:, 1])
     low, high = float(heights.min()), float(heights.max())
     is_low, is_high = heights < low + 0.2 * (high - low), heights > high - 0.2 * (high - low)
-    return _Pane(low, high, float(widths[is_low].max()), float(widths[is_high].max()))
+    return _Pane(low, high, float(half_widths[is_low].max()), float(half_widths[is_high].max()))
 
 
-def _behind(surface: Surface, detail: int, driver: Driver | None) -> list[Mesh]:
+def _behind(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
     """The rear window: headrests before the light of the windscreen."""
-    pane = _pane(surface)
-    if pane is None:
+    window_pane = _pane(surface)
+    if window_pane is None:
         return []
-    corners = 8 if detail == 2 else 6
-    height = pane.high - pane.low
-    head = min(0.10, 0.3 * height)
-    rear_rests: list[Outline] = [ellipse((y, pane.up(0.36)), (0.13, head), corners) for y in (0.35, -0.35)]
-    front_rests: list[Outline] = [ellipse((y, pane.up(0.62)), (0.10, head), corners) for y in (SEAT_Y, -SEAT_Y)]
-    pieces = [
-        (pane.band(0.34, 0.93, 0.84), BEYOND, LAYER),
+    corner_count = 8 if detail == 2 else 6
+    height = window_pane.high - window_pane.low
+    head_size = min(0.10, 0.3 * height)
+    rear_rests: list[Outline] = [
+        ellipse((y, window_pane.up(0.36)), (0.13, head_size), corner_count) for y in (0.35, -0.35)
+    ]
+    front_rests: list[Outline] = [
+        ellipse((y, window_pane.up(0.62)), (0.10, head_size), corner_count) for y in (SEAT_Y, -SEAT_Y)
+    ]
+    draped_pieces = [
+        (window_pane.band(0.34, 0.93, 0.84), BEYOND, LAYER),
         (front_rests, SEAT, 2 * LAYER),
-        ([*pane.band(0.04, 0.36, 0.90), *rear_rests], SEAT, 4 * LAYER),
+        ([*window_pane.band(0.04, 0.36, 0.90), *rear_rests], SEAT, 4 * LAYER),
     ]
     if detail == 2:
-        pieces.append((rectangle((-0.11, pane.up(0.84)), (0.11, pane.up(0.93))), SEAT, 2 * LAYER))
+        draped_pieces.append((rectangle((-0.11, window_pane.up(0.84)), (0.11, window_pane.up(0.93))), SEAT, 2 * LAYER))
     if driver is not None:
-        pieces.append(([ellipse((SEAT_Y, pane.up(0.66)), (0.075, 1.15 * head), corners)], driver.skin, 3 * LAYER))
-    return patches(surface, pieces)
-
-
-def _ahead(surface: Surface, detail: int, driver: Driver | None) -> list[Mesh]:
-    """The windscreen: dashboard, seats and steering wheel before the light of the rear window."""
-    pane = _pane(surface)
-    if pane is None:
-        return []
-    corners = 8 if detail == 2 else 6
-    height = pane.high - pane.low
-    seats: list[Outline] = []
-    for y in (SEAT_Y, -SEAT_Y):
-        seats += trapezoid((y - 0.24, pane.up(0.10)), (y + 0.24, pane.up(0.50)), (y - 0.19, y + 0.19))
-        seats.append(ellipse((y, pane.up(0.62)), (0.12, min(0.09, 0.2 * height)), corners))
-    pieces = [
-        (pane.band(0.46, 0.88, 0.66), BEYOND, LAYER),
-        (seats, CLOTH, 2 * LAYER),
-        (pane.band(0.02, 0.15, 0.92), BOARD, 4 * LAYER),
-        (rectangle((-0.12, pane.up(0.84)), (0.12, pane.up(0.92))), BOARD, 4 * LAYER),
-    ]
-    if driver is not None:
-        torso = trapezoid(
-            (SEAT_Y - 0.23, pane.up(0.10)), (SEAT_Y + 0.23, pane.up(0.48)), (SEAT_Y - 0.15, SEAT_Y + 0.15)
+        draped_pieces.append(
+            ([ellipse((SEAT_Y, window_pane.up(0.66)), (0.075, 1.15 * head_size), corner_count)], driver.skin, 3 * LAYER)
         )
-        face = ellipse((SEAT_Y, pane.up(0.64)), (0.078, min(0.11, 0.25 * height)), corners)
-        pieces += [(torso, driver.shirt, 3 * LAYER), ([face], driver.skin, 3 * LAYER)]
+    return patches(surface, draped_pieces)
+
+
+def _ahead(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
+    """The windscreen: dashboard, seats and steering wheel before the light of the rear window."""
+    window_pane = _pane(surface)
+    if window_pane is None:
+        return []
+    corner_count = 8 if detail == 2 else 6
+    height = window_pane.high - window_pane.low
+    seat_outlines: list[Outline] = []
+    for y in (SEAT_Y, -SEAT_Y):
+        seat_outlines += trapezoid(
+            (y - 0.24, window_pane.up(0.10)), (y + 0.24, window_pane.up(0.50)), (y - 0.19, y + 0.19)
+        )
+        seat_outlines.append(ellipse((y, window_pane.up(0.62)), (0.12, min(0.09, 0.2 * height)), corner_count))
+    draped_pieces = [
+        (window_pane.band(0.46, 0.88, 0.66), BEYOND, LAYER),
+        (seat_outlines, CLOTH, 2 * LAYER),
+        (window_pane.band(0.02, 0.15, 0.92), BOARD, 4 * LAYER),
+        (rectangle((-0.12, window_pane.up(0.84)), (0.12, window_pane.up(0.92))), BOARD, 4 * LAYER),
+    ]
+    if driver is not None:
+        torso_outlines = trapezoid(
+            (SEAT_Y - 0.23, window_pane.up(0.10)), (SEAT_Y + 0.23, window_pane.up(0.48)), (SEAT_Y - 0.15, SEAT_Y + 0.15)
+        )
+        face_outline = ellipse((SEAT_Y, window_pane.up(0.64)), (0.078, min(0.11, 0.25 * height)), corner_count)
+        draped_pieces += [(torso_outlines, driver.shirt, 3 * LAYER), ([face_outline], driver.skin, 3 * LAYER)]
     if detail == 2:
-        pieces.append((_arc((SEAT_Y, pane.up(0.10)), (0.19, 0.32 * height), 0.026), BOARD, 5 * LAYER))
-    return patches(surface, pieces)
+        draped_pieces.append((_arc((SEAT_Y, window_pane.up(0.10)), (0.19, 0.32 * height), 0.026), BOARD, 5 * LAYER))
+    return patches(surface, draped_pieces)
 
 
 def _arc(middle: tuple[float, float], half: tuple[float, float], thickness: float) -> list[Outline]:
@@ -158,15 +166,15 @@ def _arc(middle: tuple[float, float], half: tuple[float, float], thickness: floa
     ]
 
 
-def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: Driver | None) -> list[Mesh]:
+def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
     """The side windows, left: front seat and driver, rear seat, before the light of the windows opposite."""
     if not len(surface.corners):
         return []
-    corners = 8 if detail == 2 else 6
-    beyond: list[Outline] = []
-    seats: list[Outline] = []
-    head: list[Outline] = []
-    torso: list[Outline] = []
+    corner_count = 8 if detail == 2 else 6
+    beyond_outlines: list[Outline] = []
+    seat_outlines: list[Outline] = []
+    head_outlines: list[Outline] = []
+    torso_outlines: list[Outline] = []
     for index, (start, end) in enumerate(shell.windows):
         edges = _window_edges(shell, size, start, end)
         if edges is None:
@@ -179,31 +187,35 @@ def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: Dri
             x, z = lower + up * (upper - lower)
             return float(x), float(z)
 
-        length = float(front[0, 0] - rear[0, 0])
-        if length < 0.15:
+        window_length = float(front[0, 0] - rear[0, 0])
+        if window_length < 0.15:
             continue
-        beyond += [[point(0.05, 0.26), point(0.5, 0.26), point(0.5, 0.92), point(0.05, 0.92)]]
-        beyond += [[point(0.5, 0.26), point(0.92, 0.26), point(0.92, 0.92), point(0.5, 0.92)]]
-        if index > 1 or length < 0.5:
+        beyond_outlines += [[point(0.05, 0.26), point(0.5, 0.26), point(0.5, 0.92), point(0.05, 0.92)]]
+        beyond_outlines += [[point(0.5, 0.26), point(0.92, 0.26), point(0.92, 0.92), point(0.5, 0.92)]]
+        if index > 1 or window_length < 0.5:
             continue
         # A seat back leans; its headrest lies 0.2 m ahead of the window's rear edge.
         seat_x = rear[0, 0] + 0.20
-        seat_share = min(0.20 / length, 0.4)
+        seat_share = min(0.20 / window_length, 0.4)
         _, base = point(seat_share, 0.05)
         _, middle = point(seat_share, 0.46)
         _, top = point(seat_share, 0.62)
-        seats.append([(seat_x - 0.06, base), (seat_x + 0.16, base), (seat_x + 0.06, middle), (seat_x - 0.14, middle)])
-        seats.append(ellipse((seat_x - 0.05, top), (0.085, min(0.10, 0.35 * (middle - base))), corners))
+        seat_outlines.append(
+            [(seat_x - 0.06, base), (seat_x + 0.16, base), (seat_x + 0.06, middle), (seat_x - 0.14, middle)]
+        )
+        seat_outlines.append(ellipse((seat_x - 0.05, top), (0.085, min(0.10, 0.35 * (middle - base))), corner_count))
         if index == 0 and driver is not None:
-            _, crown = point(seat_share, 0.64)
-            head.append(ellipse((seat_x + 0.10, crown), (0.095, min(0.12, 0.4 * (middle - base))), corners))
-            torso.append(
+            _, head_middle = point(seat_share, 0.64)
+            head_outlines.append(
+                ellipse((seat_x + 0.10, head_middle), (0.095, min(0.12, 0.4 * (middle - base))), corner_count)
+            )
+            torso_outlines.append(
                 [(seat_x - 0.04, base), (seat_x + 0.30, base), (seat_x + 0.18, middle), (seat_x + 0.02, middle)]
             )
-    pieces = [(beyond, BEYOND, LAYER), (seats, SEAT, 2 * LAYER)]
+    draped_pieces = [(beyond_outlines, BEYOND, LAYER), (seat_outlines, SEAT, 2 * LAYER)]
     if driver is not None:
-        pieces += [(torso, driver.shirt, 3 * LAYER), (head, driver.skin, 4 * LAYER)]
-    return patches(surface, pieces)
+        draped_pieces += [(torso_outlines, driver.shirt, 3 * LAYER), (head_outlines, driver.skin, 4 * LAYER)]
+    return patches(surface, draped_pieces)
 
 
 def _window_edges(shell: Shell, size: Point, start: float, end: float) -> tuple[F64, F64] | None:

@@ -38,10 +38,10 @@ Pieces = list[tuple[list[Outline], Material, float]]
 def number_plate(height: float, *, front: bool, detail: int, recess: bool) -> Pieces:
     """Return a number plate at a height (m) in the middle of the front or the rear, on its recess."""
     half_width, half_height = PLATE_HALF
-    pieces: Pieces = []
+    draped_pieces: Pieces = []
     if recess:
         frame = 0.035, 0.022
-        pieces.append(
+        draped_pieces.append(
             (
                 rectangle(
                     (-half_width - frame[0], height - half_height - frame[1]),
@@ -51,17 +51,21 @@ def number_plate(height: float, *, front: bool, detail: int, recess: bool) -> Pi
                 LIFT,
             )
         )
-    pieces.append((rectangle((-half_width, height - half_height), (half_width, height + half_height)), PLATE, 3 * LIFT))
+    draped_pieces.append(
+        (rectangle((-half_width, height - half_height), (half_width, height + half_height)), PLATE, 3 * LIFT)
+    )
     side = 1.0 if front else -1.0  # y of the right edge of the plate, seen from outside, has this sign
     letters = LETTERS if detail == 2 else LETTERS[::3]
     wide = 1.0 if detail == 2 else 2.4
     for middle, half in letters:
-        low, high = sorted((side * (middle - wide * half), side * (middle + wide * half)))
-        pieces.append((rectangle((low, height - 0.036), (high, height + 0.036)), INK, 4 * LIFT))
+        lower_point, upper_point = sorted((side * (middle - wide * half), side * (middle + wide * half)))
+        draped_pieces.append((rectangle((lower_point, height - 0.036), (upper_point, height + 0.036)), INK, 4 * LIFT))
     if detail == 2:
-        low, high = sorted((-side * half_width, -side * (half_width - 0.042)))
-        pieces.append((rectangle((low, height - half_height), (high, height + half_height)), BLUE, 4 * LIFT))
-    return pieces
+        lower_point, upper_point = sorted((-side * half_width, -side * (half_width - 0.042)))
+        draped_pieces.append(
+            (rectangle((lower_point, height - half_height), (upper_point, height + half_height)), BLUE, 4 * LIFT)
+        )
+    return draped_pieces
 
 
 def rear_details(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: float) -> list[Mesh]:
@@ -77,12 +81,12 @@ def rear_details(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: 
     section = sections(shell, size, np.array([1.0]), detail=2)[0]
     half_width = float(section[S3, 1])
     has_lid = shell.deck < 0.97  # a boot lid or tailgate that ends at the belt line
-    pieces = _tail_lamps(shell, section, has_bar=chrome < BAR_SHARE and not has_lid)
+    draped_pieces = _tail_lamps(shell, section, has_bar=chrome < BAR_SHARE and not has_lid)
     plate_height = plate_heights(section, section, shell)[1]
-    pieces += number_plate(plate_height, front=False, detail=detail, recess=True)
+    draped_pieces += number_plate(plate_height, front=False, detail=detail, recess=True)
     bumper, ledge = float(section[B3, 2]) + 0.01, float(section[S2, 2])
     if not shell.clad:
-        pieces.append(
+        draped_pieces.append(
             (
                 trapezoid(
                     (-0.80 * half_width, bumper), (0.80 * half_width, bumper + 0.55 * (ledge - bumper)),
@@ -93,7 +97,7 @@ def rear_details(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: 
             )
         )  # fmt: skip
     reflector_low = ledge - 0.055
-    pieces.append(
+    draped_pieces.append(
         (
             mirrored(rectangle((0.66 * half_width, reflector_low), (0.86 * half_width, reflector_low + 0.032))),
             REFLECTOR,
@@ -102,19 +106,21 @@ def rear_details(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: 
     )
     gap = 0.010 if detail == 2 else 0.014
     lamp_edge = shell.tail_from * half_width
-    pieces.append((rectangle((-0.84 * half_width, ledge), (0.84 * half_width, ledge + gap)), SEAM, LIFT))
+    draped_pieces.append((rectangle((-0.84 * half_width, ledge), (0.84 * half_width, ledge + gap)), SEAM, LIFT))
     lid_top = float(section[S5 if has_lid else U0, 2])
     if detail == 2:
-        pieces.append((mirrored(rectangle((lamp_edge - 0.03, ledge), (lamp_edge - 0.02, lid_top))), SEAM, LIFT))
+        draped_pieces.append((mirrored(rectangle((lamp_edge - 0.03, ledge), (lamp_edge - 0.02, lid_top))), SEAM, LIFT))
     badge_height = 0.5 * (plate_height + PLATE_HALF[1] + 0.022 + lid_top)
     if lid_top - plate_height > 0.14:
-        pieces.append(([ellipse((0.0, badge_height), (0.050, 0.036), 8 if detail == 2 else 6)], CHROME, 2 * LIFT))
+        draped_pieces.append(
+            ([ellipse((0.0, badge_height), (0.050, 0.036), 8 if detail == 2 else 6)], CHROME, 2 * LIFT)
+        )
         if detail == 2:
             script = rectangle(
                 (-0.74 * lamp_edge, badge_height - 0.012), (-0.74 * lamp_edge + 0.17, badge_height + 0.012)
             )
-            pieces.append((script, CHROME, 2 * LIFT))
-    return patches(Surface(body, "rear"), pieces)
+            draped_pieces.append((script, CHROME, 2 * LIFT))
+    return patches(Surface(body, "rear"), draped_pieces)
 
 
 def plate_heights(front: F64, rear: F64, shell: Shell) -> tuple[float, float]:
@@ -125,9 +131,9 @@ def plate_heights(front: F64, rear: F64, shell: Shell) -> tuple[float, float]:
 
 def _tail_lamps(shell: Shell, section: F64, *, has_bar: bool) -> Pieces:
     """Clusters: reversing lamp and indicator below, a light guide above; the lens is that of the shell."""
-    low, high = section[shell.tail_lamps[0]], section[min(shell.tail_lamps[1], U0)]
-    inner, outer = shell.tail_from * float(low[1]) + 0.01, 0.985 * float(low[1])
-    base, height, width = float(low[2]), float(high[2] - low[2]), outer - inner
+    lower_point, upper_point = section[shell.tail_lamps[0]], section[min(shell.tail_lamps[1], U0)]
+    inner, outer = shell.tail_from * float(lower_point[1]) + 0.01, 0.985 * float(lower_point[1])
+    base, height, width = float(lower_point[2]), float(upper_point[2] - lower_point[2]), outer - inner
 
     def cell(left: float, right: float, bottom: float, top: float) -> list[Outline]:
         return mirrored(
@@ -137,7 +143,7 @@ def _tail_lamps(shell: Shell, section: F64, *, has_bar: bool) -> Pieces:
         )  # fmt: skip
 
     # At lower detail the shell has fewer rows, and its lens is lower than the cluster.
-    pieces: Pieces = [
+    draped_pieces: Pieces = [
         (cell(0.0, 1.0, 0.46, 1.0), TAIL, 0.5 * LIFT),
         (cell(0.0, 1.0, 0.0, 0.46), DARK_LENS, LIFT),
         (cell(0.08, 0.36, 0.08, 0.34), CLEAR, 2 * LIFT),
@@ -146,20 +152,20 @@ def _tail_lamps(shell: Shell, section: F64, *, has_bar: bool) -> Pieces:
     ]
     if has_bar:
         strip = rectangle((-inner, base + 0.58 * height), (inner, base + 0.92 * height))
-        pieces.append((strip, TAIL, LIFT))
-    return pieces
+        draped_pieces.append((strip, TAIL, LIFT))
+    return draped_pieces
 
 
 def front_details(shell: Shell, size: Point, body: Mesh, *, detail: int) -> list[Mesh]:
     """Return the fittings of the front: lamps in their housings, grille, badge, plate (see `rear_details`)."""
     section = sections(shell, size, np.array([0.0]), detail=2)[0]
-    low, high = section[shell.lamps[0]], section[min(shell.lamps[1], S5)]
-    inner, outer = shell.lamp_from * float(low[1]) + 0.008, 0.985 * float(low[1])
-    base, height, width = float(low[2]), float(high[2] - low[2]), outer - inner
+    lower_point, upper_point = section[shell.lamps[0]], section[min(shell.lamps[1], S5)]
+    inner, outer = shell.lamp_from * float(lower_point[1]) + 0.008, 0.985 * float(lower_point[1])
+    base, height, width = float(lower_point[2]), float(upper_point[2] - lower_point[2]), outer - inner
     corners = 8 if detail == 2 else 6
     lens_half = 0.24 * height, 0.20 * height
     lenses = [ellipse((inner + share * width, base + 0.40 * height), lens_half, corners) for share in (0.30, 0.68)]
-    pieces: Pieces = [
+    draped_pieces: Pieces = [
         (mirrored(rectangle((inner, base + 0.80 * height), (outer, base + height))), HEAD, LIFT),
         (mirrored(rectangle((inner, base), (outer, base + 0.80 * height))), HOUSING, LIFT),
         (mirrored(lenses if detail == 2 else lenses[:1]), HEAD, 2 * LIFT),
@@ -168,21 +174,25 @@ def front_details(shell: Shell, size: Point, body: Mesh, *, detail: int) -> list
     half = 0.84 * shell.lamp_from * float(section[S3, 1])
     for share in (0.2, 0.5, 0.8) if detail == 2 else ():
         bar_height = grille_low + share * (grille_high - grille_low)
-        pieces.append((rectangle((-half, bar_height - 0.007), (half, bar_height + 0.007)), GRILLE_BAR, LIFT))
+        draped_pieces.append((rectangle((-half, bar_height - 0.007), (half, bar_height + 0.007)), GRILLE_BAR, LIFT))
     badge_height = 0.5 * (grille_low + grille_high)
-    pieces.append(([ellipse((0.0, badge_height), (0.058, 0.050), corners)], CHROME, 2 * LIFT))
-    pieces += number_plate(plate_heights(section, section, shell)[0], front=True, detail=detail, recess=False)
+    draped_pieces.append(([ellipse((0.0, badge_height), (0.058, 0.050), corners)], CHROME, 2 * LIFT))
+    draped_pieces += number_plate(plate_heights(section, section, shell)[0], front=True, detail=detail, recess=False)
     bumper, ledge = float(section[B3, 2]), float(section[S2, 2])
-    edge = float(low[1])
+    outer_edge = float(lower_point[1])
     if detail == 1:  # the shell of higher detail has rows for it
-        intake = trapezoid((-0.72 * edge, bumper), (0.72 * edge, ledge - 0.03), (-0.66 * edge, 0.66 * edge))
-        pieces.append((intake, TRIM, 0.5 * LIFT))
-    else:
-        insets = trapezoid(
-            (0.72 * edge, bumper + 0.45 * (ledge - bumper)), (0.93 * edge, ledge), (0.80 * edge, 0.93 * edge)
+        air_intake = trapezoid(
+            (-0.72 * outer_edge, bumper), (0.72 * outer_edge, ledge - 0.03), (-0.66 * outer_edge, 0.66 * outer_edge)
         )
-        pieces.append((mirrored(insets), TRIM, LIFT))
-    return patches(Surface(body, "front"), pieces)
+        draped_pieces.append((air_intake, TRIM, 0.5 * LIFT))
+    else:
+        corner_insets = trapezoid(
+            (0.72 * outer_edge, bumper + 0.45 * (ledge - bumper)),
+            (0.93 * outer_edge, ledge),
+            (0.80 * outer_edge, 0.93 * outer_edge),
+        )
+        draped_pieces.append((mirrored(corner_insets), TRIM, LIFT))
+    return patches(Surface(body, "front"), draped_pieces)
 
 
 def plain_side(shell: Shell, size: Point, body: Mesh, handles: F64, material: Material) -> list[Mesh]:
@@ -195,19 +205,19 @@ def plain_side(shell: Shell, size: Point, body: Mesh, handles: F64, material: Ma
         handles: Middles of the door handles (x, z), m.
         material: That of the handles.
     """
-    edges = np.unique([edge for _, start, end in shell.doors for edge in (start, end)])
+    edges = np.unique([outer_edge for _, start, end in shell.doors for outer_edge in (start, end)])
     half_sections = sections(shell, size, np.array([*edges, sum(shell.axles) / 2.0]), detail=2)
     *door_sections, middle = half_sections
     floor, sill = float(middle[B3, 2]), float(middle[B3, 2] + 0.35 * (middle[S2, 2] - middle[B3, 2]))
     reach = shell.arch * shell.radius * size[2]
-    ends = [axle_x(shell, size, axle) for axle in shell.axles]
-    gaps: list[Outline] = []
+    axle_places = [axle_x(shell, size, axle) for axle in shell.axles]
+    gap_outlines: list[Outline] = []
     for section in door_sections:
         x = float(section[S4, 0])
-        gaps += rectangle((x - 0.007, max(sill, float(section[B3, 2]))), (x + 0.007, float(section[U0, 2])))
-    pieces: Pieces = [
-        (rectangle((ends[1] + reach, floor), (ends[0] - reach, sill)), TRIM, LIFT),
-        (gaps, SEAM, LIFT),
+        gap_outlines += rectangle((x - 0.007, max(sill, float(section[B3, 2]))), (x + 0.007, float(section[U0, 2])))
+    draped_pieces: Pieces = [
+        (rectangle((axle_places[1] + reach, floor), (axle_places[0] - reach, sill)), TRIM, LIFT),
+        (gap_outlines, SEAM, LIFT),
         ([rectangle((x - 0.09, z - 0.016), (x + 0.09, z + 0.016))[0] for x, z in handles.tolist()], material, 2 * LIFT),
     ]
-    return [both_sides(mesh) for mesh in patches(Surface(body, "left"), pieces)]
+    return [both_sides(mesh) for mesh in patches(Surface(body, "left"), draped_pieces)]

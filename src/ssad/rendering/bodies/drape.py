@@ -17,6 +17,7 @@ Piece = tuple[Sequence[Outline], Material, float]
 """Outlines, their material, and their lift above the surface, m."""
 FLAT = 0.002  # m: a cell whose fourth corner lies nearer to the plane of the others is one face
 MIN_PIECE = 2e-6  # m^2: smaller pieces are left out
+NEEDLE = 1e-4  # m: triangles with a shorter edge are left out
 BEHIND = 0.02  # m behind the nearest face from which a face is hidden
 STEEPEST = 0.05  # cosine between the axis and the normal of a face from which a face counts as seen
 _VIEWS = {"front": (0, 1.0), "rear": (0, -1.0), "left": (1, 1.0), "right": (1, -1.0)}
@@ -119,6 +120,10 @@ class Surface:
         material = np.broadcast_to(numbers[owner][:, None], is_face.shape)[is_face]
         faces = faces[is_face]
         vertices, vertex_normals = positions.reshape(-1, 3), normals.reshape(-1, 3)
+        # Cuts near a corner leave needles, which readers of mesh files weld away.
+        edge_lengths = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, -1, axis=1)], axis=-1)
+        is_needle = edge_lengths.min(axis=1) < NEEDLE
+        faces, material = faces[~is_needle], material[~is_needle]
         directions = cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
         is_turned = sign * directions[:, axis] < 0.0
         faces[is_turned] = faces[is_turned][:, ::-1]

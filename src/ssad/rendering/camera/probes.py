@@ -20,6 +20,7 @@ from ssad.rendering.camera.kernels import probe as kernels
 from ssad.rendering.camera.kernels import probe_light, shade, sky
 from ssad.rendering.camera.lamps import nearby_lights, struct_array
 from ssad.rendering.camera.scene import ObjectTable, RenderScene, collect_objects
+from ssad.rendering.camera.street_lighting import UNLIT
 from ssad.rendering.camera.visibility import VisibilityPass, empty_sun_map, sun_map
 
 if TYPE_CHECKING:
@@ -78,7 +79,8 @@ def gather_probes(
         else:
             place = tuple(np.floor(view.pose[:2, 3] / SQUARE).astype(int).tolist())
             centre = np.array([*((np.array(place) + 0.5) * SQUARE), HEIGHT])
-        key = (place, light, shadows, lamps)
+        place = (place, view.weather.lighting == UNLIT)
+        key = (place, view.weather.lighting, light, shadows, lamps)
         if key not in known_rows:
             known_rows[key] = len(texels)
             lit_texels = store.texels.pop(key, None) if scene.street is not None else None
@@ -133,6 +135,7 @@ def _probe_views(scene: RenderScene, view: View, centre: F64) -> VisibilityPass:
         axes=poses[:, :3, 2],
         reach=REACH,
         far=far,
+        street_lit=np.full(len(poses), view.weather.lighting != UNLIT),
     )
     half = SIDE / 2
     lens = np.tile(np.array([half, half, half - 0.5, half - 0.5], np.float32), (len(poses), 1))
@@ -151,7 +154,7 @@ def _probe_poses(centre: F64) -> F64:
     for index, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         # columns: right, down, ahead
         poses[index, :3, :3] = np.array([[y, -x, 0], [0, 0, -1], [x, y, 0]], np.float64).T
-    poses[4, :3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], np.float64).T
+    poses[4, :3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float64).T
     return poses
 
 

@@ -6,11 +6,13 @@ import json
 import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from helpers.run_folder import write_lines
 
+from benchmarks.physical_distance import write_figures
 from ssad.experiments.perception.physical.approach_page import (
     approach_figures,
     approach_table,
@@ -160,6 +162,14 @@ def test_the_figure_has_hollow_points_where_nothing_is_proven(approached: Physic
     assert svg.count("<polygon") == 3, "bands of clean, control and attack"
     assert "30 km/h" in svg
     assert "50 km/h" not in svg, "beyond the axis"
+
+
+def test_a_figure_for_the_documentation_stands_alone(approached: PhysicalRun, tmp_path: Path) -> None:
+    (line,) = write_figures(approached.run.folder, "physical", tmp_path)
+    assert line.endswith("(../images/physical-yolov5n-oldmarket-camouflage.svg)")
+    written = (tmp_path / "physical-yolov5n-oldmarket-camouflage.svg").read_text()
+    assert "var(" not in written
+    assert ElementTree.fromstring(written).tag == "{http://www.w3.org/2000/svg}svg"
 
 
 def test_the_first_detection_stands_beside_what_a_stop_leaves(approached: PhysicalRun) -> None:

@@ -75,7 +75,7 @@ class Grid(Schema):
         return len(self.distances) * len(self.azimuths) * len(self.elevations) * len(self.weathers)
 
 
-class Approach(Schema):
+class ApproachViews(Schema):
     """Views on the way to the target, from far to near: in each town of a test, and of a training.
 
     The camera has the focal length of all recordings, 1.1 times the side of the image. A car 1.43 m high is 80 m away
@@ -180,7 +180,7 @@ class TargetTable(Schema):
     seeds: int = Field(default=3, ge=1)
     inks: bool = True
     grid: Grid | None = None
-    approach: Approach | None = None
+    approach: ApproachViews | None = None
     behind: float = Field(default=20.0, ge=3.0, le=60.0)
     distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0], min_length=1)
     size: int = Field(default=640, ge=64)

@@ -10,7 +10,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 LEVELS = wp.constant(6)
-STEPS = wp.constant(2)  # of the search for the point that a mirror shows
+STEPS = wp.constant(3)  # of the search for the point that a mirror shows
 ROUGH = wp.constant(0.65)  # roughness from which no such point is sought
 
 
@@ -114,16 +114,22 @@ def mirrored_light(probes: Probes, view: int, ray: wp.vec3, p: wp.vec3, roughnes
         offset = p - probes.centre[probe]
         along = wp.dot(offset, ray)
         beside = wp.dot(offset, offset) - along * along
-        for _step in range(STEPS):
+        travel = float(0.0)
+        for step in range(STEPS):
             inverse = probe_texel(probes, probe, direction, lower)[3]
             # What is 1 km away or further shows no parallax.
-            if inverse < 1.0e-3:
-                direction = ray
-            else:
+            if inverse > 1.0e-3:
                 distance = 1.0 / inverse
                 # the point of the ray at this distance from the probe, or the nearest to it
-                travel = wp.sqrt(wp.max(distance * distance - beside, 0.0)) - along
-                direction = offset + ray * wp.max(travel, 0.01)
+                reach = wp.max(wp.sqrt(wp.max(distance * distance - beside, 0.0)) - along, 0.01)
+                if step > 0:
+                    # Short steps do not jump to and fro between a surface and what is behind its edge.
+                    reach = 0.5 * (wp.min(reach, 2.0 * travel) + travel)
+                travel = reach
+            elif travel > 0.0:
+                travel = 1.5 * travel
+            if travel > 0.0:
+                direction = offset + ray * travel
     share = level - float(lower)
     texel = probe_texel(probes, probe, direction, lower)
     if share > 0.02:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.rendering.camera.kernels.light import Near, cell_of
+from ssad.rendering.camera.kernels.light import Near, cell_of, lamp_emission
 from ssad.rendering.camera.kernels.matter import textured
 from ssad.rendering.camera.kernels.probe import direction_of
 from ssad.rendering.camera.kernels.raster import LAST
@@ -62,10 +62,8 @@ def arriving_light(
     albedo = textured(surface, albedo, hit.uv, hit.distance * 2.0 / (float(side) * hit.slant))
     cell = cell_of(hit.place, eye)
     lit = light_at(light, shadows, near, 0, cell, hit.place, hit.normal, 1.0)
-    glow = surface.emission + surface.night * light.lamps
-    if surface.lamp == 1 and draw_samples.lit[hit.draw] == 0:
-        glow = 0.0
-    colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
+    emission = lamp_emission(surface, draw_samples.lit[hit.draw], 0.0, draw_samples.split[hit.draw], light.lamps)
+    colour = wp.cw_mul(albedo, lit.light) + emission
     transmission = air_transmission(light, hit.distance)
     colour = wp.cw_mul(colour, transmission) + wp.cw_mul(light.horizon, wp.vec3(1.0, 1.0, 1.0) - transmission)
     return wp.vec4(colour[0], colour[1], colour[2], 1.0 / wp.max(hit.distance, 0.1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from ssad.scenarios.static.physical.textures.card import (
     shipped_textures,
 )
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
+from ssad.scenarios.static.physical.textures.inks import project_onto_gamut, share_outside
 
 CARD = TextureCard(
     "vanishing", "camouflage", {"texels": 32}, "yolov5n", "abc", "sedan:silver:0", "d", "c", 3, {"AP50": 0.1}
@@ -39,6 +41,18 @@ def test_a_texture_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert np.array_equal(np.rint(colour.permute(1, 2, 0).numpy() * 255), picture())
     assert (card.attack, card.options, card.metrics) == (CARD.attack, CARD.options, CARD.metrics)
     assert len(card.hash) == 64
+
+
+def test_a_texture_of_inks_is_written_only_if_they_give_all_of_its_colours(tmp_path: Path) -> None:
+    printed = replace(CARD, inks="FOGRA39")
+    with pytest.raises(ConfigError, match=r"\d\d\.\d% of the texels are no colours of FOGRA39"):
+        save_texture(tmp_path / "mine", picture(), printed)
+    assert not list(tmp_path.iterdir())
+    colour = project_onto_gamut(torch.from_numpy(picture()).permute(2, 0, 1).float() / 255)
+    save_texture(tmp_path / "mine", np.rint(colour.permute(1, 2, 0).numpy() * 255).astype(np.uint8), printed)
+    shown, card = load_texture(str(tmp_path / "mine.json"))
+    assert card.inks == "FOGRA39"
+    assert share_outside(shown) == 0.0
 
 
 def test_a_changed_or_broken_texture_is_one_line(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from ssad.core import safeio
-from ssad.core.errors import FormatError, unknown_name
+from ssad.core.errors import ConfigError, FormatError, unknown_name
 from ssad.core.images import read_image, save_picture
 from ssad.core.types import U8
 from ssad.core.version import __version__
+from ssad.scenarios.static.physical.textures.inks import share_outside
 
 SHIPPED = Path(__file__).parent / "trained"
 
@@ -38,6 +39,7 @@ class TextureCard:
         metrics: Results on the town of the test, which `data` names.
         hash: SHA-256 of size and texels; set by `save_texture`.
         version: Version of SSAD; set by `save_texture`.
+        inks: Characterisation of the inks in which it was trained; "": any colour.
     """
 
     attack: str
@@ -52,6 +54,7 @@ class TextureCard:
     metrics: Mapping[str, float] = field(default_factory=dict)
     hash: str = ""
     version: str = ""
+    inks: str = ""
 
 
 def shipped_textures() -> list[str]:
@@ -96,7 +99,13 @@ def save_texture(path: Path, image: U8, card: TextureCard) -> None:
         path: Path without a suffix.
         image: RGB [H, W, 3].
         card: Card; its hash and version are set here.
+
+    Raises:
+        ConfigError: The card names inks that do not give all colours of the image.
     """
+    colour = torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
+    if card.inks and (outside := share_outside(colour)):
+        raise ConfigError(f"{path}: {outside:.1%} of the texels are no colours of {card.inks}; project it first")
     card_data = asdict(card) | {"hash": _hash(image), "version": __version__}
     save_picture(path.with_suffix(".png"), image)
     safeio.write_atomic(path.with_suffix(".json"), safeio.dump_json(card_data, indent=1) + "\n")

@@ -26,7 +26,7 @@ from ssad.rendering.meshes.obj_writer import write_obj
 from ssad.rendering.target import Target, parse_target
 from ssad.scenarios.static.physical import TextureSurface, albedo_of, make_carrier
 from ssad.scenarios.static.physical.textures.carrier import covered_colour, metres_of
-from ssad.scenarios.static.physical.textures.inks import printable_colours
+from ssad.scenarios.static.physical.textures.inks import printable_colours, share_outside
 from ssad.scenarios.static.physical.textures.printing import conspicuousness, non_printability
 
 LARGEST = 16384  # dots of a side
@@ -161,6 +161,7 @@ def export_texture(out: Path, texture: PrintedTexture, *, dots: int = 1000, name
         "rectangle": [round(coordinate, 6) for coordinate in _rectangle(surface)],
         "panels": _panels(mesh),
         "non_printability": round(printability, 4),
+        "outside_gamut": round(share_outside(colour, mask), 4),
         "delta_e": round(colour_distance, 2),
     }
     safeio.write_atomic(out / "texture.json", safeio.dump_json(description, indent=1) + "\n")

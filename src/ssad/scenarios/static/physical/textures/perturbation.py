@@ -26,6 +26,7 @@ from ssad.scenarios.static.perturbation import EGO, Perturbation, TargetImages
 from ssad.scenarios.static.physical.textures.card import load_texture
 from ssad.scenarios.static.physical.textures.carrier import albedo_of
 from ssad.scenarios.static.physical.textures.export import PrintedTexture, load_printed_texture
+from ssad.scenarios.static.physical.textures.inks import project_onto_gamut
 from ssad.scenarios.static.physical.textures.spec import make_carrier
 from ssad.world.models import MODELS
 
@@ -48,6 +49,7 @@ class Texture(Perturbation):
         texture: Name of a shipped texture, "grey" or "grey-sign" (the controls: a car, or the plate of a sign, painted
             grey all over), path of a card (NAME.json beside NAME.png), or folder that `ssad export texture` wrote.
         label: Name in tables; "": that of the texture or of its file.
+        project: Whether its colours are first moved to the nearest that inks can give.
 
     Raises:
         UnknownNameError: No shipped texture has the name.
@@ -56,6 +58,7 @@ class Texture(Perturbation):
 
     texture: str
     label: str = ""
+    project: bool = False
     severity: int = field(default=1, init=False)
     family: str = field(default="texture", init=False)
 
@@ -69,7 +72,8 @@ class Texture(Perturbation):
 
     def printed_texture(self) -> PrintedTexture:
         """Return the texture with all settings that put it on its target."""
-        return _load_printed_texture(self.texture)
+        printed_texture = _load_printed_texture(self.texture)
+        return _projected(self.texture) if self.project else printed_texture
 
     @property
     def needs_target(self) -> bool:
@@ -83,7 +87,7 @@ class Texture(Perturbation):
 
     def version(self) -> str:
         """Return the hash of the texture; "" for the controls, which the code decides."""
-        return _hash_of(self.texture)
+        return _hash_of(self.texture) + ("-projected" if self.project else "")
 
     def applies_to(self, episode: Episode, town: LaneGraph) -> int | None:
         """Return the first car (or walker) besides the ego; for signs the ego, if one stands beside its route."""
@@ -163,6 +167,12 @@ def _load_printed_texture(name: str) -> PrintedTexture:
         return load_printed_texture(Path(name).expanduser())
     texture, card = load_texture(name)
     return PrintedTexture(texture, card.carrier, card.options, card.target)
+
+
+@lru_cache(maxsize=64)
+def _projected(name: str) -> PrintedTexture:
+    printed_texture = _load_printed_texture(name)
+    return replace(printed_texture, colour=project_onto_gamut(printed_texture.colour))
 
 
 @lru_cache(maxsize=256)
