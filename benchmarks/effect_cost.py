@@ -1,7 +1,7 @@
 """Cost of the effects of the rendering: python benchmarks/effect_cost.py [--effects NAME,...] [--out FILE]
 
-The street of `camera_speed.py` by day, with a low sun ahead and on a wet road, 640 x 640 and 640 x 384 pixels, on one
-core. A picture without any effect and one with an effect are rendered in turn; the cost is the median of the
+The street of `camera_speed.py` by day, with a low sun ahead, on a wet road and at night, 640 x 640 and 640 x 384
+pixels, on one core. A picture without any effect and one with an effect are rendered in turn; the cost is the median of the
 differences in process time, so that a busy machine slows both alike. `finish` is metallic paint, dirt and wear on all
 vehicles. The camera does not move: the first picture makes the probe of `reflections`, and the others share it.
 """
@@ -50,7 +50,7 @@ def cost(base: Callable[[], object], changed: Callable[[], object], repeats: int
 
 
 def views_of(view: View) -> dict[str, View]:
-    """Return the view at 640 x 640 and at 640 x 384, by day, with a low sun ahead, and on a wet road."""
+    """Return the view at 640 x 640 and at 640 x 384, by day, with a low sun ahead, on a wet road and at night."""
     heading = float(np.arctan2(view.pose[1, 2], view.pose[0, 2]))
     low = replace(view.weather, sun_height=0.15, sun_heading=heading + 0.1)
     wet = replace(view.weather, wet=0.8, clouds=0.8)
@@ -60,6 +60,7 @@ def views_of(view: View) -> dict[str, View]:
         "640 x 384": replace(view, camera=wide),
         "640 x 640, low sun": replace(view, weather=low),
         "640 x 640, wet": replace(view, weather=wet),
+        "640 x 640, night": replace(view, weather=replace(view.weather, sun_height=-0.2)),
     }
 
 

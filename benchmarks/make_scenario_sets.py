@@ -275,6 +275,33 @@ def past_stop_signs(towns: Mapping[str, int]) -> list[Scenario]:
     return found
 
 
+STRAIGHTS = {"Longreach": (22.0, 15.0, 175.0), "ProvingGround": (16.0, 15.0, 165.0), "Ringmere": (12.0, 10.0, 160.0)}
+"""Town -> target speed, m/s, and the part of its longest lanes that is straight, m."""
+BENDS = {
+    "Longreach": (22.0, 180.0, 420.0),
+    "ProvingGround": (15.0, 150.0, 330.0),
+    "Ringmere": (11.0, 120.0, 290.0),
+    "Larkhill": (10.0, 15.0, 255.0),
+}
+"""The same, of parts with a bend."""
+
+
+def marked_roads() -> list[Scenario]:
+    """Return drives without other road users along marked roads without junctions: straight ones first, then bends."""
+    found = []
+    for name, parts, lanes in (("straight", STRAIGHTS, 2), ("bend", BENDS, 1)):
+        for town, (speed, start, end) in parts.items():
+            graph = load_town(town)
+            is_road = (graph.kind == LaneType.DRIVING) & (graph.junction < 0)
+            longest = sorted(np.flatnonzero(is_road).tolist(), key=lambda lane: (-float(graph.length[lane]), lane))
+            for number, lane in enumerate(longest[:lanes]):
+                places = np.linspace(start, end, max(int((end - start) / 50.0), 1) + 1)
+                route = tuple(_pose(graph, lane, float(place)) for place in places)
+                title = f"lane-keeping/{town}_{name}_{number:02d}"
+                found.append(Scenario(title, "Custom", town, route, target_speed=speed, group=name))
+    return found
+
+
 def _approach(graph: LaneGraph, passage: Stretch) -> int:
     """The last lane before a junction."""
     inside = next(k for k, lane in enumerate(passage.lanes) if graph.junction[lane] >= 0)
@@ -375,6 +402,7 @@ def make() -> dict[str, str]:
         "natural.yaml": scenario_text(with_crossing_traffic(NATURAL_TOWNS, NATURAL)),
         "natural-unselected.yaml": scenario_text(unselected(NATURAL_TOWNS, NATURAL)),
         "stop-signs.yaml": scenario_text(past_stop_signs(SIGN_TOWNS)),
+        "lane-keeping.yaml": scenario_text(marked_roads()),
     }
 
 

@@ -25,6 +25,7 @@ SYSTEMS: dict[str, str] = {
     "careful-fsm": "ssad.drivers.careful.driver:CarefulFSM",
     "careful-reg157": "ssad.drivers.careful.driver:CarefulReg157",
     "careful-rss": "ssad.drivers.careful.driver:CarefulRSS",
+    "lane-keeper": "ssad.drivers.lane_keeping.driver:LaneKeeper",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
     "no-action": "ssad.drivers.builtin:NoAction",
     "perceiving": "ssad.drivers.perceiving.systems:ComposedSystem",

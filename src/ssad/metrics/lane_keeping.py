@@ -16,11 +16,11 @@ from ssad.core.perception import PerceivedLane
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 
-SURE: Final = 0.5  # confidence from which on a lane counts as detected
+SURE: Final = 0.7  # confidence from which on a lane counts as detected
 
 
 @dataclass(frozen=True, eq=False)
-class LanePosition:
+class PositionInLane:
     """Position of the ego in its lane at each of T steps.
 
     Attributes:
@@ -36,7 +36,7 @@ class LanePosition:
     width: F64
 
 
-def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> LanePosition:
+def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> PositionInLane:
     """Return the position of the ego in the lane of its route.
 
     Args:
@@ -60,7 +60,7 @@ def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> LanePosition:
     deviation = direction[:, 0] * chosen[:, 1] - direction[:, 1] * chosen[:, 0]
     yaw = np.arctan2(direction[:, 1], direction[:, 0])
     heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - yaw))
-    return LanePosition(deviation, heading, arc[nearest] + along[rows, nearest], _widths(graph, starts)[nearest])
+    return PositionInLane(deviation, heading, arc[nearest] + along[rows, nearest], _widths(graph, starts)[nearest])
 
 
 def _widths(graph: LaneGraph, points: F64) -> F64:
@@ -73,7 +73,7 @@ def _widths(graph: LaneGraph, points: F64) -> F64:
     return widths[nearest]
 
 
-def is_outside(position: LanePosition, length: float, width: float) -> Bool:
+def is_outside(position: PositionInLane, length: float, width: float) -> Bool:
     """Return the steps [T] in which the ego's body reaches over a line of its lane.
 
     Args:

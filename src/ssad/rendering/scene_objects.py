@@ -27,6 +27,8 @@ from ssad.world.models import SURROGATES, stated_size, trace_sizes
 
 Size = tuple[float, float, float]  # length, width, height
 KERB = 0.12  # m, height of sidewalks
+BAY = 0.14  # m, height of parking bays
+BAY_EDGE = 0.2  # m between the road and a vehicle in a bay
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
@@ -443,20 +445,8 @@ def _add_parked_vehicles(  # noqa: PLR0917
     occupancy = float(rng.uniform(0.25, 0.75))
     kinds, weights = list(shares), np.array(list(shares.values()))
     parking_lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
-    kerb_places = []
-    for lane in np.flatnonzero(graph.kind == LaneType.SHOULDER):
-        sidewalk = int(graph.right[lane])
-        if sidewalk < 0 or graph.kind[sidewalk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
-            continue
-        if graph.left[lane] >= 0 and graph.is_divided(int(graph.left[lane])):
-            continue  # nobody parks in a roundabout
-        distance = 9.0 + float(rng.uniform(0, 3))
-        while distance < float(graph.length[lane]) - 9.0:
-            x, y, yaw, width = graph.at(int(lane), distance)  # the edge of the driving lane:
-            kerb_places.append(
-                (x - width / 2 * np.sin(yaw), y + width / 2 * np.cos(yaw), yaw, KERB if width < 1 else 0.0)
-            )
-            distance += 6.5
+    bays = np.asarray(street.bays, float)
+    kerb_places = [(x, y, yaw, BAY) for x, y, yaw in bays[:, :3].tolist()]
     parking_spots = []
     for spot_index, place in enumerate([*parking_lots, *kerb_places]):
         if (
@@ -476,7 +466,12 @@ def _add_parked_vehicles(  # noqa: PLR0917
         style = "parked" if body_kind in ("motorcycle", "bicycle") else draw_style(body_kind, generator=prop_rng)
         size = draw_size(body_kind, style, generator=prop_rng)
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
-        lateral_offset = size[1] / 2 + 0.08 if spot_index >= len(parking_lots) else 0.0
+        lateral_offset = 0.0
+        if spot_index >= len(parking_lots):
+            _, _, _, depth, room = bays[spot_index - len(parking_lots)]
+            lateral_offset = size[1] / 2 + BAY_EDGE
+            if lateral_offset + size[1] / 2 > depth or size[0] / 2 > room:
+                continue  # it would stand on the pavement
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
         towing = towing_vehicle(style, size) if body_kind == "trailer" else None
         room = PARKED[body_kind][1] if towing is None else towing.length + TRAILER_GAP

@@ -55,6 +55,7 @@ _MATERIALS: Final = {
     SemanticClass.BUILDING: (
         *("awning", "boards", "brick", "cladding", "door", "plaster", "plinth", "roof_tiles", "roofing_felt", "sheet"),
         *("shop_window", "window", "window_blind", "window_frame"),
+        *("shop_back", "shop_ceiling", "shop_goods", "window_curtain", "window_room"),
     ),
     SemanticClass.WALL: ("stone",),
     SemanticClass.FENCE: ("wood",),
@@ -62,11 +63,14 @@ _MATERIALS: Final = {
     SemanticClass.TRAFFIC_LIGHT: ("signal_red", "signal_amber", "signal_green", "black_plastic"),
     SemanticClass.TRAFFIC_SIGN: ("sign_white", "sign_red", "sign_blue", "sign_yellow", "sign_back", "sign_ink"),
     SemanticClass.VEGETATION: (
-        *("leaves_round", "leaves_tall", "leaves_birch", "leaves_conifer", "hedge", "bark", "forest"),
+        *("leaves_round", "leaves_tall", "leaves_birch", "leaves_conifer", "hedge", "bark", "forest", "tree_line"),
     ),
-    SemanticClass.TERRAIN: ("meadow", "dry_grass", "soil", "lawn", "hills"),
+    SemanticClass.TERRAIN: (
+        *("meadow", "dry_grass", "grass", "grass_blades", "soil", "lawn", "hills"),
+        *("field_meadow", "field_crop", "field_stubble", "field_soil"),
+    ),
     SemanticClass.ROAD_LINE: ("marking_white", "marking_yellow"),
-    SemanticClass.GROUND: ("driveway",),
+    SemanticClass.GROUND: ("driveway", "parking_bay"),
 }
 CLASS_OF_MATERIAL: Final = {name: label for label, names in _MATERIALS.items() for name in names}
 """Class of a material of the street by its name; others are static objects."""

@@ -33,12 +33,13 @@ DASH, PERIOD = 3.0, 9.0  # m
 EXPOSURE = 0.78  # code value over albedo, both linear
 FOOTPRINT = 1.0 / 764.0  # 1/m: a pixel row covers so much times the square of the distance, m
 ENOUGH = 2.5  # m
+COARSE = TopView(half_width=4.0, row_step=1.0)
 LANE_WIDTH = 3.5  # m
 LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
 
 
 @dataclass(frozen=True, slots=True)
-class Approach:
+class RoadApproach:
     """A drive over a straight road towards the patch.
 
     Attributes:
@@ -63,11 +64,11 @@ def to_srgb(albedo: Tensor) -> Tensor:
     return torch.where(albedo <= 0.0031308, 12.92 * albedo, 1.055 * albedo.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def draw_approaches(count: int, *, key: tuple[object, ...]) -> list[Approach]:
+def draw_approaches(count: int, *, key: tuple[object, ...]) -> list[RoadApproach]:
     """Return random approaches."""
     random = generator("road patch", *key)
     return [
-        Approach(
+        RoadApproach(
             float(random.uniform(11.0, 24.0)),
             float(random.uniform(-0.15, 0.15)),
             float(random.uniform(3.4, 3.8)),
@@ -79,7 +80,7 @@ def draw_approaches(count: int, *, key: tuple[object, ...]) -> list[Approach]:
     ]
 
 
-def road_brightness(patch: Tensor, grid: TopView, approach: Approach, pose: Tensor) -> Tensor:
+def road_brightness(patch: Tensor, grid: TopView, approach: RoadApproach, pose: Tensor) -> Tensor:
     """Return the brightness of the road as the lane keeper sees it from above, code values [R, C].
 
     Args:
@@ -89,29 +90,36 @@ def road_brightness(patch: Tensor, grid: TopView, approach: Approach, pose: Tens
         pose: Ego's x, y and yaw on the road [3]; y = 0 is the middle of the lane.
     """
     ahead, lateral = (torch.from_numpy(values).float() for values in (grid.ahead, grid.lateral))
-    total = torch.zeros(len(ahead), len(lateral))
-    width = patch.shape[1] * CELL[1]
-    shares = (-0.35, 0.0, 0.35)
-    for share in shares:
-        # A pixel averages over its footprint along the road.
-        row = (ahead + share * FOOTPRINT * ahead**2)[:, None]
-        x = pose[0] + row * torch.cos(pose[2]) - lateral * torch.sin(pose[2])
-        y = pose[1] + row * torch.sin(pose[2]) + lateral * torch.cos(pose[2])
-        blur = 0.5 * (LINE_WIDTH + row / 506.0)
-        right = ((0.5 * LINE_WIDTH + blur - (y + 0.5 * approach.width - 0.1).abs()) / (2.0 * blur)).clamp(0.0, 1.0)
-        left = ((0.5 * LINE_WIDTH + blur - (y - 0.5 * approach.width).abs()) / (2.0 * blur)).clamp(0.0, 1.0)
+    albedo_sum = torch.zeros(len(ahead), len(lateral))
+    patch_width = patch.shape[1] * CELL[1]
+    footprint_shares = (-0.35, 0.0, 0.35)
+    for footprint_share in footprint_shares:
+        # A pixel averages over its footprint along the ground_albedo.
+        distance_ahead = (ahead + footprint_share * FOOTPRINT * ahead**2)[:, None]
+        place_along = pose[0] + distance_ahead * torch.cos(pose[2]) - lateral * torch.sin(pose[2])
+        place_across = pose[1] + distance_ahead * torch.sin(pose[2]) + lateral * torch.cos(pose[2])
+        line_blur = 0.5 * (LINE_WIDTH + distance_ahead / 506.0)
+        right_line = (
+            (0.5 * LINE_WIDTH + line_blur - (place_across + 0.5 * approach.width - 0.1).abs()) / (2.0 * line_blur)
+        ).clamp(0.0, 1.0)
+        left_line = (
+            (0.5 * LINE_WIDTH + line_blur - (place_across - 0.5 * approach.width).abs()) / (2.0 * line_blur)
+        ).clamp(0.0, 1.0)
         if not approach.solid:
-            left = left * (((x + approach.phase) % PERIOD) < DASH)
-        u, v = -2.0 * y / width, -2.0 * x / LENGTH
-        dirt = functional.grid_sample(
-            patch[None, None], torch.stack([u, v], -1)[None], align_corners=False, padding_mode="border"
+            left_line = left_line * (((place_along + approach.phase) % PERIOD) < DASH)
+        texture_column, texture_row = -2.0 * place_across / patch_width, -2.0 * place_along / LENGTH
+        patch_albedo = functional.grid_sample(
+            patch[None, None],
+            torch.stack([texture_column, texture_row], -1)[None],
+            align_corners=False,
+            padding_mode="border",
         )[0, 0]
-        is_patch = (u.abs() < 1.0) & (v.abs() < 1.0)
-        road = torch.where(is_patch, dirt, torch.full_like(dirt, ASPHALT_ALBEDO))
-        marked = (left + right).clamp(0.0, 1.0)
-        marked = torch.where(is_patch, torch.zeros_like(marked), marked)  # dirt covers lines
-        total = total + road * (1.0 - marked) + LINE_ALBEDO * marked
-    return 255.0 * to_srgb((total / len(shares) * EXPOSURE * approach.gain).clamp(1e-4, 1.0))
+        is_patch = (texture_column.abs() < 1.0) & (texture_row.abs() < 1.0)
+        ground_albedo = torch.where(is_patch, patch_albedo, torch.full_like(patch_albedo, ASPHALT_ALBEDO))
+        line_share = (left_line + right_line).clamp(0.0, 1.0)
+        line_share = torch.where(is_patch, torch.zeros_like(line_share), line_share)  # patch_albedo covers lines
+        albedo_sum = albedo_sum + ground_albedo * (1.0 - line_share) + LINE_ALBEDO * line_share
+    return 255.0 * to_srgb((albedo_sum / len(footprint_shares) * EXPOSURE * approach.gain).clamp(1e-4, 1.0))
 
 
 def marking_strength(brightness: Tensor, grid: TopView) -> Tensor:
@@ -125,7 +133,7 @@ def marking_strength(brightness: Tensor, grid: TopView) -> Tensor:
 
 
 class LaneModel:
-    """Differentiable copy of `ssad.drivers.lane_keeping.lane.LaneFilter`.
+    """Differentiable copy of `ssad.drivers.lane_keeping.lane.LaneFilter`, which is always sure of its markings.
 
     Args:
         grid: Top view.
@@ -180,7 +188,7 @@ class LaneModel:
         self.covariance = 0.5 * (covariance + covariance.T)
 
 
-def deviation(patch: Tensor, approach: Approach, grid: TopView, *, seconds: float = 2.5) -> Tensor:
+def deviation(patch: Tensor, approach: RoadApproach, grid: TopView, *, seconds: float = 2.5) -> Tensor:
     """Return the place of the ego beside the middle of its lane at each step of a drive over the patch [T], m.
 
     Args:
@@ -240,6 +248,7 @@ def train_road_patch(
     side: float = 1.0,
     seed: int = 0,
     report: bool = False,
+    grid: TopView = COARSE,
 ) -> tuple[Tensor, list[float]]:
     """Return the albedo [H, W] of a patch that leads the lane keeper out of its lane, and the deviations, m.
 
@@ -252,8 +261,8 @@ def train_road_patch(
         side: 1: to the left; -1: to the right.
         seed: Seed of the approaches and of the first patch.
         report: Whether each fifth step is printed.
+        grid: Top view of the lane keeper, coarser than its own.
     """
-    grid = TopView(half_width=4.0, row_step=1.0)
     share = start_patch(width, shift=1.6 * side, seed=seed).clamp(0.0, 1.0).requires_grad_()
     optimiser = torch.optim.Adam([share], lr=rate)
     history = []
@@ -294,7 +303,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         weights="",
         target="road",
         data="straight roads of the differentiable copy of its loop",
-        command=f"python -m ssad.training.road_patch --width {options.width:g} --steps {options.steps} --seed {options.seed}",
+        command=f"python -m ssad.training.road_patch --width {options.width:g} --steps {options.steps} "
+        f"--seed {options.seed}",
         epochs=options.steps,
         metrics={"deviation": float(np.mean(history[-10:]))},
     )

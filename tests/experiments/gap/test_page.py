@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
-from ssad.experiments.gap.page import ceiling_table, error_table, scatter, section, sign_table
+from ssad.experiments.gap.page import (
+    ceiling_table,
+    error_table,
+    lane_courses,
+    lane_table,
+    scatter,
+    section,
+    sign_table,
+)
 from ssad.report.load import Run, load_run
 
 DRIVES = 40
@@ -116,3 +124,37 @@ def test_stop_signs_have_a_table_where_they_were_read(run: Run) -> None:
     assert row.cells[0].mean == pytest.approx(0.5)
     assert row.cells[1].text == "n/a"
     assert (row.cells[3].text, row.cells[4].text) == ("1.00", "0.75")
+
+
+def test_lane_keepers_have_a_table_and_a_figure(run: Run, tmp_path: Path) -> None:
+    assert lane_table(run).rows == ()
+    assert lane_courses(run) == ""
+    lines = []
+    for name, severity, largest in (("none", 0, 0.2), ("dirty-road", 1, 3.0)):
+        record = line((name, severity), 0, 0.5, crash=False)
+        is_led_astray = severity > 0
+        lane_metrics = {
+            "off_road": 0.0,
+            "distance_to_route": 0.1,
+            "lane_deviation": 0.1,
+            "lane_deviation_max": largest,
+            "lane_departure": float(is_led_astray),
+            "departure_time": 1.5 if is_led_astray else None,
+            "lane_error": 0.1,
+            "lane_seen": 1.0,
+        }
+        course = {"along": [0.0, 2.0], "deviation": [0.0, largest], "margin": [0.8, 0.8]}
+        spec = {"repetition": 0, "scenario": {"name": "road"}}
+        lines.append(record | {"metrics": record["metrics"] | lane_metrics, "lane": course, "spec": spec})
+    suite = {"kind": "gap", "name": "x", "sheets": 0, "ceilings": []}
+    steered = load_run(write_run(tmp_path / "steered", {"kind": "gap", "suite": suite, "command": "ssad run x"}, lines))
+    table = lane_table(steered)
+    assert [row.head[1:] for row in table.rows] == [("none", ""), ("dirty-road", "1")]
+    by_name = dict(zip(table.columns, table.rows[1].cells, strict=True))
+    assert by_name["leaves the lane"].mean == 1.0
+    assert by_name["after, s"].mean == 1.5
+    assert by_name["at most, m"].mean == 3.0
+    text, tables = section(steered)
+    assert "lanes" in [one.name for one in tables]
+    assert "dirty-road" in lane_courses(steered)
+    assert "Deviation from the middle of the lane along the route" in text

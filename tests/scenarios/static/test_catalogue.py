@@ -83,7 +83,8 @@ def test_every_registered_name_is_made_and_written_as_itself() -> None:
         entry = parse_perturbation(name)
         assert entry.family == family
         assert entry.model_dump(mode="json") == name
-        assert {one.family for one in entry.at([1, 5])} <= {family}
+        made = {one.family for one in entry.at([1, 5])}
+        assert made <= {family} or (family == "own" and made <= {"texture", "light", "sign"})
 
 
 @pytest.mark.parametrize(

@@ -32,15 +32,14 @@ from ssad.drivers.lane_keeping.control import (
     pursuit_curvature,
     steer_for,
 )
-from ssad.drivers.lane_keeping.lane import LaneFilter
+from ssad.drivers.lane_keeping.lane import SURE, LaneFilter
 from ssad.drivers.lane_keeping.markings import RoadMap, TopView, marking_strength
 from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
-from ssad.drivers.perceiving.parts import Perceiver
+from ssad.drivers.perceiving.parts import Perceiver, make_perceiver, part_version
 from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_cameras
 from ssad.world.models import agent_model
 
 CHANNEL: Final = "CAM_FRONT"
-SURE: Final = 0.5  # confidence from which on markings count as detected
 PATIENCE: Final = 1.5  # s without markings before it slows down
 
 
@@ -60,7 +59,8 @@ class LaneKeeper(PerceivingDriver):
     """Lane keeper with one front camera.
 
     Args:
-        perceiver: Source of detections of other road users; None: a perfect detector.
+        perceiver: Source of detections of other road users, or its name (`ssad list perceivers`); None: a perfect
+            detector, so that all errors are those of the lane.
         camera: Camera of the lane markings; None: the front camera of the nuScenes rig, 640 px wide.
         grid: Top view in which markings are detected; None: the usual one.
         **settings: Further arguments of `PerceivingDriver`.
@@ -73,7 +73,7 @@ class LaneKeeper(PerceivingDriver):
 
     def __init__(
         self,
-        perceiver: Perceiver | None = None,
+        perceiver: Perceiver | str | None = None,
         *,
         camera: Camera | None = None,
         grid: TopView | None = None,
@@ -81,13 +81,19 @@ class LaneKeeper(PerceivingDriver):
     ) -> None:
         if settings.get("planner") is not None:
             raise ConfigError("a lane keeper plans itself; leave out the planner")
-        super().__init__(perceiver or PerfectPerceiver(), **settings)
+        parts = make_perceiver(perceiver) if isinstance(perceiver, str) else perceiver or PerfectPerceiver()
+        super().__init__(parts, **settings)
         self.controller = Controller.EXTERNAL
         self.__dict__.pop("believe", None)  # the Autopilot does not plan for it
         self.lane_camera = camera or nuscenes_cameras()[CHANNEL]
         self.road_map = RoadMap(self.lane_camera, grid or TopView())
         self.sensors = tuple(dict.fromkeys((*self.sensors, CHANNEL)))
         self._scenes: list[_Scene] = []
+
+    @staticmethod
+    def version_of_parts(*, perceiver: str = "", **_: object) -> str:
+        """Return the version of a perceiver that is named, for the keys of results; arguments as of the class."""
+        return part_version("perceiver", perceiver, make_perceiver(perceiver), {}) if perceiver else ""
 
     @property
     def cameras(self) -> Mapping[str, Camera]:

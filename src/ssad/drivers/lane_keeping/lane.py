@@ -26,6 +26,7 @@ INITIAL: Final = (0.6, 0.08, 0.01, 0.3)  # the same at the start
 STEP: Final = 0.1  # s
 USUAL_WIDTH: Final = 3.5  # m
 WIDTHS: Final = (2.6, 4.4)  # m
+SURE: Final = 0.7  # confidence from which on markings count as detected; below, the predicted lane is held
 HALF_ROWS: Final = 12  # rows of full strength with which a lane is as sure as not
 SEARCH: Final = (  # values of offset, heading, curvature and width of the search for a lane
     np.arange(-1.2, 1.21, 0.15),
@@ -46,6 +47,7 @@ class LaneFilter:
         self.grid = grid
         self.state: F64 | None = None
         self.covariance: F64 = np.diag(np.square(INITIAL))
+        self._is_sure = True
         ahead = grid.ahead
         ones = np.ones_like(ahead)
         self._row_weight = np.minimum(FULL_WEIGHT / ahead, 1.0) ** 2 * grid.row_step / NOISE_STEP
@@ -69,7 +71,7 @@ class LaneFilter:
         # The ego turns about the half of its way.
         self.state[0] -= 0.5 * forward * turn
         self.state[1] -= turn
-        steps = seconds / STEP
+        steps = seconds / STEP if self._is_sure else 0.0
         self.covariance = motion @ self.covariance @ motion.T + np.diag(np.square(CHANGE)) * steps
 
     def held(self) -> PerceivedLane | None:
@@ -104,10 +106,15 @@ class LaneFilter:
                 weights.append(float(weight.sum()))
             self.state = np.linalg.solve(information, pull)
             self.state[3] = np.clip(self.state[3], *WIDTHS)
-            total = sum(weights)
+            total = sum(weights) * self.grid.row_step / NOISE_STEP
             confidence = total / (total + HALF_ROWS)
             covariance = np.linalg.inv(information)
-        self.covariance = 0.5 * (covariance + covariance.T)
+        self._is_sure = confidence >= SURE
+        if not self._is_sure:
+            # A few spurious ridges would pull a lane without lines away: it moves with the ego alone.
+            self.state = prior
+        else:
+            self.covariance = 0.5 * (covariance + covariance.T)
         return PerceivedLane(*self.state.tolist(), confidence)
 
 

@@ -49,13 +49,13 @@ class TopView:
     @property
     def ahead(self) -> F64:
         """Distance of each row [R], m."""
-        return np.arange(self.near, self.far + 1e-9, self.row_step)
+        return np.arange(self.near, self.far + 1e-9, self.row_step, dtype=np.float64)
 
     @property
     def lateral(self) -> F64:
         """Place of each column [C], m to the left."""
         count = round(self.half_width / self.column_step)
-        return np.arange(count, -count - 1, -1) * self.column_step
+        return np.arange(count, -count - 1, -1, dtype=np.float64) * self.column_step
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ The same drive gives metrics of the component, on the images of the driver itsel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -127,9 +128,7 @@ class Gap(ScenarioKind):
         Column("lane_deviation_max", "greatest distance to it", "m", "lower", limits=NOT_NEGATIVE),
         Column("lane_departure", "share of the drives that leave the lane", "", "lower", limits=SHARE),
         Column("departure_time", "time to the departure from the lane", "s", "higher", limits=NOT_NEGATIVE),
-        Column(
-            "lane_error", "error of the middle of the lane that the camera found", "m", "lower", limits=NOT_NEGATIVE
-        ),
+        Column("lane_error", "error of the middle of the lane found", "m", "lower", limits=NOT_NEGATIVE),
         Column("lane_seen", "share of the steps in which the lane was found", "", "higher", limits=SHARE),
     )
     factors = ("system", "perturbation", "severity")
@@ -239,6 +238,9 @@ class Gap(ScenarioKind):
                     place = getattr(perturbation_of(cell.spec), "place_distance", None)
                     graph = cached_town(trace.town)
                     metrics |= lane_metrics(trace, graph, perceived.lanes, place=place, view=VIEW_AHEAD)
+                    metrics |= {
+                        name: None for name, value in metrics.items() if value is not None and math.isnan(value)
+                    }
                     record_fields["lane"] = lane_course(trace, graph)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
                 if job.settings["sheets"] and (sheet_images := perception.images(index)):
@@ -326,8 +328,9 @@ class Condition:
 
     @property
     def needs_target(self) -> bool:
-        """True if the perturbation needs an agent, or a sign, to be on."""
-        return self.perturbation is not None and self.perturbation.needs_target
+        """True if the perturbation needs an agent, a sign or a place along the route to be on."""
+        perturbation = self.perturbation
+        return perturbation is not None and (perturbation.needs_target or perturbation.needs_place)
 
 
 def conditions_of(suite: GapSuite) -> list[Condition]:

@@ -54,11 +54,13 @@ def _panel(title: str, lines: Mapping[str, Course], top: int) -> list[str]:
         along = start + share * (end - start)
         elements.append(label_text(x(along), top + HEIGHT + 15, f"{along:.0f} m", anchor="middle"))
     for side in (1.0, -1.0):
-        points = _points([(x(along), y(side * width)) for along, width in zip(longest["along"], longest["margin"])])
+        edge = zip(longest["along"], longest["margin"], strict=True)
+        points = _points([(x(along), y(side * width)) for along, width in edge])
         elements.append(element("polyline", points=points, fill="none", stroke="var(--soft)", stroke_dasharray="1 4"))
     for index, (name, course) in enumerate(lines.items()):
         colour, dashes = series_colour(index), DOTS[(index // 5) % len(DOTS)]
-        points = _points([(x(along), y(value)) for along, value in zip(course["along"], course["deviation"])])
+        places = zip(course["along"], course["deviation"], strict=True)
+        points = _points([(x(along), y(value)) for along, value in places])
         tip = element("title", escape(name))
         elements.append(
             element(

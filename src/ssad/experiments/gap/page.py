@@ -14,10 +14,10 @@ from typing import Literal
 
 from ssad.core import safeio
 from ssad.core.folders import path_inside
+from ssad.experiments.gap.lane_figure import course_plot
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.rank import family_correlation
-from ssad.experiments.gap.lane_figure import course_plot
 from ssad.report.figures import MetricChange, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
@@ -66,8 +66,10 @@ LANES = {
 }
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
-BOUNDED = ("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
-BOUNDED += ("lane_departure", "lane_seen")
+BOUNDED = (
+    *("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40"),
+    *("lane_departure", "lane_seen"),
+)
 CONDITION = {
     "System": field("system"),
     "Perturbation": field("perturbation"),
@@ -304,13 +306,11 @@ def lane_table(run: Run) -> Table:
         rows=CONDITION,
         columns=LANES,
         metric=_cell,
-        condition=lambda lines: any(
-            metric_of(line, "lane_deviation") == metric_of(line, "lane_deviation") for line in lines
-        ),
-        note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, route completed. "
-        "A drive leaves the lane where the body crosses a line; after: from the moment when the cause comes into view, "
-        "or from the start where there is none, of the drives that do. From the middle: mean distance to it. Error of "
-        "the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
+        condition=lambda lines: not all(math.isnan(metric_of(line, "lane_deviation")) for line in lines),
+        note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, share of it "
+        "that is completed. A drive leaves the lane where the body crosses a line; after: from the moment when the "
+        "cause comes into view, or from the start where there is none, of the drives that do. From the middle: mean "
+        "distance to it. Error of the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
     )
 
 

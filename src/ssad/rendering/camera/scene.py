@@ -40,6 +40,12 @@ PATTERNS = {
     "hedge": matter.LEAF,
     "forest": matter.LEAF,
     "hills": matter.LEAF,
+    "tree_line": matter.LEAF,
+    "field_meadow": matter.LEAF,
+    "field_crop": matter.LEAF,
+    "field_stubble": matter.LEAF,
+    "field_soil": matter.GRAIN,
+    "parking_bay": matter.GRAIN,
     "leaves_round": matter.LEAF,
     "leaves_tall": matter.LEAF,
     "leaves_birch": matter.LEAF,
@@ -49,6 +55,11 @@ PATTERNS = {
     "boards": matter.TILE,
     "window": matter.GLASS,
     "shop_window": matter.GLASS,
+    "window_curtain": matter.GLASS,
+    "window_room": matter.GLASS,
+    "shop_back": matter.GLASS,
+    "shop_ceiling": matter.GLASS,
+    "shop_goods": matter.GLASS,
 }
 
 

@@ -12,7 +12,15 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import home_folder
 from ssad.core.seeding import generator
 from ssad.rendering.meshes.mesh import F32
-from ssad.rendering.street.dressing import Masts, place_furniture, place_signal_masts, place_street_lamps, plant_trees
+from ssad.rendering.street.bays import lay_bays
+from ssad.rendering.street.dressing import (
+    Masts,
+    place_furniture,
+    place_signal_masts,
+    place_street_lamps,
+    plant_grass,
+    plant_trees,
+)
 from ssad.rendering.street.free_ground import FreeGround, sides
 from ssad.rendering.street.markings import paint_markings
 from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
@@ -40,7 +48,12 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     """
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)
-    materials = TownMaterials(STYLES[name], Palette(), generator("street", graph.name, seed, name))
+    materials = TownMaterials(
+        STYLES[name],
+        Palette(),
+        generator("street", graph.name, seed, name),
+        generator("street details", graph.name, seed, name),
+    )
     builder, ground = TriangleBuilder(), survey(graph)
     free_ground, masts, street_sides = FreeGround(graph, ground), Masts(), sides(graph)
     # The order matters: each step occupies free ground and draws from the same generator.
@@ -52,6 +65,8 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
     place_furniture(builder, free_ground, materials, street_sides)
     plant_trees(builder, free_ground, materials, plots.parks)
+    plant_grass(builder, free_ground, materials, street_sides)
+    bays = lay_bays(builder, free_ground, materials)
     geometry = join(builder.pieces)
     origin, nx, ny, order, offset = tiles(np.concatenate(builder.owner), geometry.levels)
     return Street(
@@ -74,6 +89,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
         head_signal=np.array(masts.signal, np.int32),
         head_lens=np.array(masts.lens, np.int32).reshape(-1, 3, 2),
         parking=_f32(plots.parking, 3),
+        bays=_f32(bays, 5),
     )
 
 

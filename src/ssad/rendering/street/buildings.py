@@ -16,6 +16,7 @@ from ssad.rendering.street.facades import (
     evenly_spaced,
     flat_roof,
     gable,
+    shop_window,
     walls,
     window_grid,
     windows,
@@ -141,6 +142,7 @@ def _shop_front(w: float, ground: float, front: Wall, materials: TownMaterials) 
             parts.append(
                 flat(front.quads(start + 0.08, 0.55, end - start - 0.16, ground - 1.5, 0.05), glass, levels=VISIBLE)
             )
+            parts += shop_window(front, start + 0.08, 0.55, (end - start - 0.16, ground - 1.5), materials)
     parts.append(flat(front.quads(door_centre - 0.5, 0.05, 1.0, 2.2, 0.05), materials.shop[0], levels=VISIBLE))
     colour = materials.pick("awning")
     board, board_back = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, distance) for distance in (0.12, 0.0))
@@ -292,6 +294,9 @@ def _office(size: Size, materials: TownMaterials, *, floors: int | None = None) 
         if side_index in (0, 1, 3):
             window_edges = np.arange(0.6, wall.length - 3.0, 3.2)
             parts.append(flat(wall.quads(window_edges, 0.3, 2.7, 2.7, 0.04), shop_material, levels=VISIBLE))
+            lit = window_edges[materials.details.random(len(window_edges)) < 0.6]
+            room = materials.details.choice(materials.room, len(lit))
+            parts.append(flat(wall.quads(lit + 0.25, 1.1, 2.2, 1.6, 0.045), room, levels=NEAR))
     parts.append(flat(sides[0].quads(width / 2 - 1.4, 0.0, 2.8, 2.7, 0.08), materials.glass[0], levels=VISIBLE))
     parts.append(box((-2.0, -1.4, 2.9), (2.0, 0.0, 3.15), materials.metal, levels=VISIBLE, base=True))
     if rng.random() < 0.7:

@@ -11,11 +11,13 @@ from ssad.rendering.street.free_ground import CELL, FreeGround, Side
 from ssad.rendering.street.furniture import bench, bollard, lamp, litter_bin, planter, shelter, sign, signal_mast
 from ssad.rendering.street.model import NEAR
 from ssad.rendering.street.palette import TownMaterials
-from ssad.rendering.street.paving import EARTH, KERB
-from ssad.rendering.street.plants import bush, tree
+from ssad.rendering.street.paving import BELOW, EARTH, KERB
+from ssad.rendering.street.plants import bush, tree, tuft
 from ssad.rendering.street.triangles import TriangleBuilder, flat
 
 BIN_ROOM = 0.45  # m between a kerb and the middle of a thing beside it
+TUFT_SPACING = 0.8  # m between tufts of grass along a verge
+MAX_TUFTS = 4000  # of a town
 
 
 @dataclass
@@ -233,3 +235,26 @@ def plant_trees(
             material = materials.lawn if style.old else materials.dry if rng.random() < 0.6 else materials.soil
             corners = np.column_stack([outline, np.full(9, EARTH + 0.006)])[None]
             triangles.add(flat(corners, material, levels=NEAR), point)
+
+
+def plant_grass(triangles: TriangleBuilder, ground: FreeGround, materials: TownMaterials, sides: list[Side]) -> None:
+    """Tufts of grass along the edges of lawns: behind sidewalks, and beside roads without one."""
+    if materials.style.old:
+        return
+    rng = materials.details
+    total = sum(side.length for side in sides)
+    spacing = max(TUFT_SPACING, total / MAX_TUFTS)
+    poses = []
+    for side in sides:
+        for station in np.arange(0.5 * spacing, side.length, spacing).tolist():
+            offset = float(rng.uniform(0.06, 0.5)) if side.kerb else float(rng.uniform(0.5, 1.6))
+            x, y, _ = side.pose(station + float(rng.normal(0.0, 0.3)), offset)
+            turn, z = float(rng.uniform(0.0, 2.0 * np.pi)), EARTH - 0.02 if side.kerb else BELOW
+            if ground.is_free((x, y), distance=0.02):
+                poses.append((x, y, z, turn))
+    tufts = [tuft(materials) for _ in range(6)]
+    kinds = rng.integers(0, len(tufts), len(poses))
+    sizes = rng.uniform(0.6, 1.3, len(poses))
+    for index, piece in enumerate(tufts):
+        chosen = np.flatnonzero(kinds == index)
+        triangles.place(piece, np.array(poses).reshape(-1, 4)[chosen], scale=sizes[chosen])

@@ -102,6 +102,7 @@ def windows(
         ),
         flat(wall.quads(x, z, width, height, 0.045), glass_materials, levels=VISIBLE),
     ]
+    parts += _inside_windows(wall, x, z, size, materials)
     # wide windows have a mullion
     if width > 0.9:
         parts.append(flat(wall.quads(x + width / 2 - 0.03, z, 0.06, height, 0.06), frame, levels=NEAR))
@@ -110,6 +111,79 @@ def windows(
         back = wall.quads(x - 0.12, z - 0.06, width + 0.24, 0.0, 0.0)
         top = np.stack([front[:, 3], front[:, 2], back[:, 1], back[:, 0]], axis=1)
         parts.append(flat(np.concatenate([front, top]), materials.stone[0], levels=NEAR))
+    return parts
+
+
+def _inside_windows(
+    wall: Wall, x: F64, z: F64, size: tuple[float, float], materials: TownMaterials
+) -> list[TrianglePiece]:
+    """What is seen through windows: curtains at their sides, blinds half down, the lighter wall of a room, a sill."""
+    rng, (width, height) = materials.details, size
+    inside = 0.049  # m before the wall: just before the glass, whose gloss these materials have
+    kind = rng.random(len(x))
+    parts = []
+    curtains = np.flatnonzero(kind < 0.34)
+    if len(curtains):
+        share = rng.uniform(0.12, 0.27, len(curtains)) * width
+        cloth = rng.choice(materials.curtain, len(curtains))
+        left, foot = x[curtains], z[curtains]
+        parts.append(flat(wall.quads(left, foot, share, height, inside), cloth, levels=NEAR))
+        parts.append(flat(wall.quads(left + width - share, foot, share, height, inside), cloth, levels=NEAR))
+    blinds = np.flatnonzero((kind >= 0.34) & (kind < 0.5))
+    if len(blinds):
+        drop = rng.uniform(0.2, 0.7, len(blinds)) * height
+        cloth = rng.choice([*materials.blind, materials.curtain[0]], len(blinds))
+        parts.append(flat(wall.quads(x[blinds], z[blinds] + height - drop, width, drop, inside), cloth, levels=NEAR))
+    rooms = np.flatnonzero((kind >= 0.5) & (kind < 0.85))
+    if len(rooms):
+        # The far wall of a room is lighter than its floor, and off the middle.
+        share, edge = rng.uniform(0.35, 0.8, (2, len(rooms)))
+        low = rng.uniform(0.25, 0.5, len(rooms)) * height
+        left = x[rooms] + edge * (1.0 - share) * width
+        room = rng.choice(materials.room, len(rooms))
+        parts.append(
+            flat(wall.quads(left, z[rooms] + low, share * width, 0.92 * height - low, inside), room, levels=NEAR)
+        )
+    return parts
+
+
+def shop_window(
+    wall: Wall, x: float, z: float, size: tuple[float, float], materials: TownMaterials
+) -> list[TrianglePiece]:
+    """What is seen through a shop window: the back of the shop, its lit ceiling, shelves of goods and a poster."""
+    rng, (width, height) = materials.details, size
+    inside = wall.quads
+    back_height = rng.uniform(0.55, 0.7) * height
+    parts = [
+        flat(
+            inside(x + 0.08 * width, z + 0.3 * height, 0.84 * width, back_height, 0.052),
+            int(rng.choice(materials.shop_back)),
+            levels=VISIBLE,
+        )
+    ]
+    lamps = max(1, int(width / 1.3))
+    lefts = x + width * (np.arange(lamps) + 0.3) / lamps
+    parts.append(
+        flat(inside(lefts, z + 0.9 * height, 0.4 * width / lamps, 0.05, 0.056), materials.shop_light, levels=NEAR)
+    )
+    for shelf in (0.0, 0.3) if rng.random() < 0.6 else (0.0,):
+        count = max(2, int(width / rng.uniform(0.25, 0.5)))
+        lefts = x + 0.05 * width + 0.9 * width * (np.arange(count) + rng.uniform(0.0, 0.4, count)) / count
+        heights = rng.uniform(0.08, 0.30, count) * height
+        widths = rng.uniform(0.4, 0.85, count) * 0.9 * width / count
+        colours = rng.choice(materials.goods, count)
+        parts.append(flat(inside(lefts, z + shelf * height + 0.03, widths, heights, 0.058), colours, levels=NEAR))
+        plank = int(materials.goods[-1])
+        parts.append(flat(inside(x, z + shelf * height, width, 0.03, 0.06), plank, levels=NEAR))
+    if rng.random() < 0.4 and width > 1.0:
+        corner = x + float(rng.uniform(0.1, 0.6)) * width
+        parts.append(
+            flat(
+                inside(corner, z + 0.45 * height, 0.22 * width, 0.4 * height, 0.06),
+                materials.sign["white"],
+                levels=NEAR,
+            )
+        )
     return parts
 
 

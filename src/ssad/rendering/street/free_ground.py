@@ -47,6 +47,10 @@ class FreeGround:
             return False
         return bool((self.ground.at(self.ground.paved, points) >= distance).all())
 
+    def is_occupied(self, points: npt.ArrayLike) -> bool:
+        """Return whether something stands at one of the points [n, 2]."""
+        return bool(self.occupied[self._cells(np.asarray(points, np.float64).reshape(-1, 2))].any())
+
     def occupy(self, points: npt.ArrayLike) -> None:
         """Mark the ground under points [n, 2] as occupied."""
         self.occupied[self._cells(np.asarray(points, np.float64).reshape(-1, 2))] = True

@@ -17,7 +17,7 @@ from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import array_dtypes
 from ssad.rendering.meshes.mesh import F32, I32, Material
 
-FORMAT = 1  # of the .npz file
+FORMAT = 2  # of the .npz file
 TILE = 32.0  # m
 LEVELS = 3
 NEAR, MID, FAR = 1, 2, 4  # bits of the levels at which a face is drawn
@@ -54,6 +54,8 @@ class Street:
         head_signal: Signal of each head in the lane graph [H].
         head_lens: First face and end of the faces of its red, amber and green lens [H, 3, 2].
         parking: x, y, yaw of places for parked cars, off the road [., 3].
+        bays: Places in parking bays at the kerb [., 5]: x, y of the side towards the road and yaw of the traffic; depth
+            of the bay; room to either end of the bay, m.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Street:
     head_signal: I32
     head_lens: I32
     parking: F32
+    bays: F32
 
     def __post_init__(self) -> None:
         # Streets are cached and shared between scenes, so their arrays must not change.
@@ -136,7 +139,7 @@ class Street:
                 getattr(self, array_name).shape == shape,
                 f"{array_name} has shape {getattr(self, array_name).shape}, not {shape}",
             )
-        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking"):
+        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking", "bays"):
             require(
                 bool(np.isfinite(getattr(self, array_name)).all()), f"{array_name} holds a number that is not finite"
             )

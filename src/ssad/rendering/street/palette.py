@@ -202,11 +202,16 @@ _WALLS = {
 
 @dataclass
 class TownMaterials:
-    """Materials of one town, as indices into its palette, and the generator that draws everything else."""
+    """Materials of one town, as indices into its palette, and the generators that draw everything else.
+
+    `generator` draws the layout: plots, buildings, furniture, places of plants. `details` draws what decorates it:
+    leaves, blades of grass, curtains, goods and fields, so that more detail moves no house.
+    """
 
     style: TownStyle
     palette: Palette
     generator: np.random.Generator
+    details: np.random.Generator
     walls: dict[str, list[int]] = field(default_factory=dict)
     leaves: dict[str, list[int]] = field(default_factory=dict)
 
@@ -277,6 +282,52 @@ class TownMaterials:
                 ("back", (0.32, 0.33, 0.34)),
             )
         }
+
+        self._add_details()
+
+    def _add_details(self) -> None:
+        """Add the materials of curtains, goods, grass, bays and fields."""
+        add, vary = self.palette.add, self._vary
+        self.curtain = [
+            add("window_curtain", vary(rgb, 0.12), specular=0.07, gloss=0.8)
+            for rgb in ((0.34, 0.33, 0.31), (0.24, 0.20, 0.16), (0.15, 0.17, 0.20), (0.22, 0.12, 0.10))
+        ]
+        self.room = [
+            add("window_room", vary(rgb, 0.2), specular=0.09, gloss=0.9)
+            for rgb in ((0.11, 0.095, 0.075), (0.075, 0.085, 0.09), (0.13, 0.125, 0.11))
+        ]
+        self.goods = [
+            add("shop_goods", vary(rgb, 0.2), specular=0.07, gloss=0.8)
+            for rgb in (
+                (0.24, 0.06, 0.05),
+                (0.06, 0.10, 0.20),
+                (0.26, 0.21, 0.10),
+                (0.07, 0.14, 0.08),
+                (0.27, 0.26, 0.24),
+                (0.03, 0.03, 0.035),
+            )
+        ]
+        self.shop_back = [
+            add("shop_back", vary(rgb, 0.15), specular=0.08, gloss=0.85)
+            for rgb in ((0.17, 0.155, 0.13), (0.12, 0.125, 0.13), (0.15, 0.11, 0.085))
+        ]
+        self.shop_light = add("shop_ceiling", (0.42, 0.40, 0.35), specular=0.08, gloss=0.8)
+        earth = np.array(list(self.palette.table)[self.earth].colour)
+        self.blades = [add("grass_blades", vary(factor * earth, 0.12)) for factor in (0.75, 1.0, 1.3)]
+        self.bay = add("parking_bay", vary((0.125, 0.12, 0.115), 0.1))
+        meadow = np.array(list(self.palette.table)[self.earth_far].colour)
+        self.fields = [
+            self.earth_far,
+            add("field_meadow", vary(0.8 * meadow, 0.1)),
+            add("field_crop", vary((0.17, 0.165, 0.06), 0.1)),
+            add("field_stubble", vary((0.24, 0.20, 0.10), 0.1)),
+            add("field_soil", vary((0.13, 0.10, 0.07), 0.1)),
+        ]
+        self.tree_line = [add("tree_line", vary(rgb, 0.15)) for rgb in ((0.05, 0.085, 0.03), (0.07, 0.10, 0.04))]
+
+    def _vary(self, colour: npt.ArrayLike, amount: float) -> npt.NDArray[np.float64]:
+        """Return the colour slightly lighter or darker, drawn with the details."""
+        return np.asarray(colour, np.float64) * self.details.uniform(1 - amount, 1 + amount)
 
     def _jitter(self, colour: npt.ArrayLike, amount: float) -> npt.NDArray[np.float64]:
         """Return the colour slightly lighter or darker, and slightly shifted in hue."""

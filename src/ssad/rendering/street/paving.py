@@ -20,6 +20,7 @@ STONE = 0.16  # m, width of a kerb stone
 EARTH = 0.10  # m, height of the ground behind a sidewalk
 BELOW = -0.03  # m, height of the ground beside a road without one
 FAR_AWAY = 3000.0  # m
+FIELD_SHARES = (0.4, 0.2, 0.2, 0.1, 0.1)  # of `TownMaterials.fields`
 STRAIGHT = 16.0  # m, longest quad of a straight line
 
 
@@ -166,16 +167,23 @@ def _add_far_ground(triangles: TriangleBuilder, ground: Ground, materials: TownM
         ]
     )
     offsets = border - centre
-    rings = [border]
-    for radius in (1.2 * float(np.hypot(*offsets.T).max()), FAR_AWAY):
-        rings.append(centre + radius * offsets / np.hypot(*offsets.T)[:, None])
-    for lower_ring, upper_ring in pairwise(rings):
-        inner_line, outer_line = np.vstack([lower_ring, lower_ring[:1]]), np.vstack([upper_ring, upper_ring[:1]])
-        triangles.add(ribbon(inner_line, outer_line, (EARTH - 0.04, EARTH - 0.04), materials.earth_far), HORIZON_OWNER)
+    town_radius = float(np.hypot(*offsets.T).max())
+    directions = offsets / np.hypot(*offsets.T)[:, None]
+    # Fields: each sector of a ring has a colour of its own, so that no single green reaches the horizon.
+    radii = [radius for radius in town_radius * np.array([1.2, 1.4, 1.7, 2.1, 2.7]) if radius < FAR_AWAY]
+    rings = [border, *(centre + radius * directions for radius in [*radii, FAR_AWAY])]
+    for index, (inner_ring, outer_ring) in enumerate(pairwise(rings)):
+        inner, outer = np.vstack([inner_ring, inner_ring[:1]]), np.vstack([outer_ring, outer_ring[:1]])
+        colours = materials.details.choice(materials.fields, len(border), p=FIELD_SHARES)
+        if index == 0:
+            colours[:] = materials.earth_far  # meadow around the town
+        outline = np.stack([outer[:-1], outer[1:], inner[1:], inner[:-1]], axis=1)
+        heights = np.full((*outline.shape[:2], 1), EARTH - 0.04)
+        triangles.add(flat(np.concatenate([outline, heights], axis=2), colours), HORIZON_OWNER)
     # A plane under everything keeps the sky from showing through between two triangles.
     corners = [[x0, y0, -0.4], [x1, y0, -0.4], [x1, y1, -0.4], [x0, y1, -0.4]]
     triangles.add(flat(np.array([corners]), materials.earth_far), HORIZON_OWNER)
-    town_radius = float(np.hypot(*offsets.T).max())
+    _add_tree_lines(triangles, centre, town_radius, materials)
     angles = np.linspace(0.0, 2.0 * np.pi, 97)
     for radius, height, material in (
         (town_radius + 350.0, 16.0, materials.hill_near),
@@ -197,3 +205,20 @@ def _add_far_ground(triangles: TriangleBuilder, ground: Ground, materials: TownM
             flat(np.stack([lower_ring[1:], lower_ring[:-1], upper_ring[:-1], upper_ring[1:]], axis=1), material),
             HORIZON_OWNER,
         )
+
+
+def _add_tree_lines(triangles: TriangleBuilder, centre: F64, town_radius: float, materials: TownMaterials) -> None:
+    """Rows of distant trees between the town and the hills: ragged bands that hide where the ground ends."""
+    rng = materials.details
+    for distance, height, count in ((60.0, 7.0, 26), (160.0, 10.0, 30), (300.0, 14.0, 30)):
+        for start in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + rng.uniform(0.0, 0.2, count):
+            radius = town_radius + distance * rng.uniform(0.8, 1.3)
+            step = rng.uniform(3.0, 5.0) / radius
+            angles = start + step * np.arange(int(rng.integers(6, 22)) + 1)
+            radii = radius + 0.3 * distance * rng.uniform(-1.0, 1.0) * np.linspace(0.0, 1.0, len(angles))
+            feet = centre + radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            tops = height * rng.uniform(0.45, 1.0, len(angles))
+            tops[[0, -1]] *= 0.3
+            lower, upper = (np.column_stack([feet, z]) for z in (np.full(len(angles), EARTH - 0.1), tops))
+            band = np.stack([lower[1:], lower[:-1], upper[:-1], upper[1:]], axis=1)
+            triangles.add(flat(band, int(rng.choice(materials.tree_line))), HORIZON_OWNER)

@@ -1,4 +1,7 @@
-"""Trees, bushes and hedges: a trunk, dark blobs inside the crown, and leaves as triangles around them."""
+"""Trees, bushes, hedges and grass: a trunk, dark blobs inside the crown, and leaf cards around them.
+
+A leaf card is a small triangle, longer than wide: the camera has no transparency.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.triangles import TrianglePiece, box, cylinder, join, smooth
 
 VISIBLE = NEAR | MID
+LEAF_WIDTH = 0.62  # half of the base of a leaf card, in half of its length
 
 
 def _icosahedron() -> tuple[F64, np.ndarray]:
@@ -77,53 +81,57 @@ def blob(
 
 
 def leaves(
-    centre: F64, radius: F64, style_materials: TownMaterials, *, count: int, size: float, materials: list[int]
+    centre: F64,
+    radius: F64,
+    style_materials: TownMaterials,
+    *,
+    count: int,
+    size: float,
+    materials: list[int],
+    levels: int = NEAR,
 ) -> TrianglePiece:
-    """Triangles about `size` m on an ellipsoid, tilted at random, with their outsides away from its centre."""
-    rng = style_materials.generator
+    """Leaf cards about `size` m long in the outer half of an ellipsoid, tilted at random, outsides away from it."""
+    rng = style_materials.details
     positions = np.arange(count) + 0.5
-    z = 1.0 - 1.85 * positions / count  # few leaves at the underside
+    z = 1.0 - 1.9 * positions / count  # few leaves at the underside
     # Golden-angle spiral: an even distribution for any number of leaves.
     azimuths = np.pi * (1.0 + 5.0**0.5) * positions + rng.uniform(0.0, 6.0)
     circle_radii = np.sqrt(np.maximum(1.0 - z * z, 0.0))
     directions = np.stack([circle_radii * np.cos(azimuths), circle_radii * np.sin(azimuths), z], axis=1)
-    centres = directions * radius * rng.uniform(0.86, 1.08, (count, 1)) + centre
-    leaf_normals = directions + 0.75 * rng.normal(size=(count, 3))
+    # Leaves of one branch stand out together: the outline is uneven at the scale of branches, too.
+    branch = np.sin(directions @ rng.normal(0.0, 3.4, 3) + rng.uniform(0.0, 6.0))
+    depth = 0.94 + 0.09 * branch + rng.uniform(-0.16, 0.10, count)
+    centres = directions * radius * depth[:, None] + centre
+    leaf_normals = directions + 0.8 * rng.normal(size=(count, 3))
     leaf_normals /= np.linalg.norm(leaf_normals, axis=1, keepdims=True)
     leaf_normals *= np.sign((leaf_normals * directions).sum(axis=1, keepdims=True) + 1e-9)
     side_axes = cross(leaf_normals, rng.normal(size=(count, 3)))
-    half_sizes = size * rng.uniform(0.6, 1.1, (count, 1, 1))
-    vertex_normals = np.repeat(directions / radius + [0.0, 0.0, 0.15], 3, axis=0)
-    # The upper leaves catch more light: lighter greens come first in the table.
-    material_index = np.clip(
-        (0.5 * (1.0 - z) * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1
-    )
-    return _leaf_triangles(
-        centres,
-        leaf_normals,
-        side_axes,
-        half_sizes,
-        (0.0, 2.0, 4.2),
-        vertex_normals,
-        np.array(materials)[material_index],
+    half_sizes = 0.5 * size * rng.uniform(0.7, 1.25, (count, 1, 1))
+    vertex_normals = directions / radius * float(np.mean(radius)) + 0.35 * leaf_normals + [0.0, 0.0, 0.15]
+    # The upper and outer leaves catch more light: lighter greens come first in the table.
+    shade = 0.5 * (1.0 - z) + 1.6 * (0.97 - depth)
+    material_index = np.clip((shade * len(materials) + rng.normal(0.0, 0.7, count)).astype(int), 0, len(materials) - 1)
+    return _leaf_cards(
+        centres, leaf_normals, side_axes, half_sizes, vertex_normals, np.array(materials)[material_index], levels=levels
     )
 
 
-def _leaf_triangles(  # noqa: PLR0917
+def _leaf_cards(  # noqa: PLR0917
     place: F64,
     outward: F64,
     side: F64,
     half: F64 | float,
-    turns: tuple[float, ...],
     normal: F64,
     material: npt.ArrayLike,
+    *,
+    levels: int = NEAR,
 ) -> TrianglePiece:
-    """A triangle about each place [n, 3]: across `outward` (unit), its corners turned from `side`, `half` m away."""
+    """A card about each place [n, 3]: across `outward` (unit), its tip along `side`, `half` m to its ends."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    cosines, sines = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
-    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(outward, side)[:, None])
+    along, across = half * side[:, None], LEAF_WIDTH * half * cross(outward, side)[:, None]
+    corners = place[:, None] + np.concatenate([-0.8 * along - across, along, -0.8 * along + across], axis=1)
     faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
-    return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
+    return smooth(corners.reshape(-1, 3), faces, np.repeat(normal, 3, axis=0), material, levels=levels)
 
 
 def _greens(kind: str, materials: TownMaterials) -> list[int]:
@@ -152,23 +160,33 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
         blob(centre, 0.98 * radius, greens[1], materials, levels=FAR, rough=0.1),
     ]
     lobe_count = {"round": 3, "tall": 2, "birch": 3}[kind]
-    leaf_count = {"round": 32, "tall": 38, "birch": 26}[kind]
+    leaf_count = {"round": 60, "tall": 68, "birch": 50}[kind]
     for lobe_index in range(lobe_count):
         angle = 2.0 * np.pi * lobe_index / lobe_count + rng.uniform(-0.5, 0.5)
         height_offset = (lobe_index / max(lobe_count - 1, 1) - 0.5) * 0.7
         lobe_offset = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), height_offset]) * radius
         lobe_radius = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
-        parts.append(blob(centre + lobe_offset, 0.9 * lobe_radius, dark_green, materials, levels=VISIBLE))
-        parts.append(
+        parts += [
+            blob(centre + lobe_offset, 0.76 * lobe_radius, dark_green, materials, levels=NEAR),
+            blob(centre + lobe_offset, 0.9 * lobe_radius, greens[-1], materials, levels=MID, rough=0.2),
             leaves(
                 centre + lobe_offset,
                 lobe_radius,
                 materials,
                 count=leaf_count,
                 size=0.33 * float(lobe_radius.mean()),
+                materials=[*greens, dark_green],
+            ),
+            leaves(
+                centre + lobe_offset,
+                lobe_radius,
+                materials,
+                count=8,
+                size=0.62 * float(lobe_radius.mean()),
                 materials=greens,
-            )
-        )
+                levels=MID,
+            ),
+        ]
     return join(parts)
 
 
@@ -211,6 +229,7 @@ def _conifer(materials: TownMaterials) -> TrianglePiece:
                 levels=VISIBLE,
             )
         )
+        parts.append(_sprays(materials, (lower, min(upper, height)), radius, greens))
         lower_vertices = np.vstack([rim, [[0.0, 0.0, lower + 0.3 * radius]]])
         lower_faces = np.stack([(indices + 1) % side_count, indices, np.full(side_count, side_count)], 1)
         lower_normals = np.broadcast_to([0.0, 0.0, -1.0], lower_vertices.shape)
@@ -218,6 +237,26 @@ def _conifer(materials: TownMaterials) -> TrianglePiece:
             smooth(lower_vertices, lower_faces, lower_normals, materials.palette.shade(greens[2], 0.6), levels=NEAR)
         )
     return join(parts)
+
+
+def _sprays(materials: TownMaterials, z: tuple[float, float], radius: float, greens: list[int]) -> TrianglePiece:
+    """Twigs of a whorl between two heights that hang outwards over its cone of a radius."""
+    rng = materials.details
+    count = max(8, int(14.0 * radius))
+    angles = rng.uniform(0.0, 2.0 * np.pi, count)
+    shares = rng.uniform(0.0, 0.75, count)
+    outwards = np.column_stack([np.cos(angles), np.sin(angles), np.full(count, 0.0)])
+    centres = (
+        outwards * (radius * (1.02 - shares))[:, None] + [0.0, 0.0, 1.0] * (z[0] + shares * (z[1] - z[0]))[:, None]
+    )
+    tilt = rng.uniform(-0.7, -0.1, count)
+    along = outwards + [0.0, 0.0, 1.0] * tilt[:, None]
+    normals = np.column_stack([np.cos(angles) * -tilt, np.sin(angles) * -tilt, np.ones(count)])
+    normals += 0.25 * rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    half = radius * rng.uniform(0.12, 0.24, (count, 1, 1))
+    shading = outwards + [0.0, 0.0, 0.6] + 0.3 * normals
+    return _leaf_cards(centres, normals, along, half, shading, np.array(greens)[rng.integers(0, 2, count)])
 
 
 def bush(materials: TownMaterials) -> TrianglePiece:
@@ -228,31 +267,61 @@ def bush(materials: TownMaterials) -> TrianglePiece:
     centre = np.array([0.0, 0.0, 0.85 * radius[2]])
     return join(
         [
-            blob(centre, 0.92 * radius, materials.palette.shade(greens[-1], 0.7), materials, levels=VISIBLE),
-            leaves(centre, radius, materials, count=36, size=0.22, materials=greens),
+            blob(centre, 0.8 * radius, materials.palette.shade(greens[-1], 0.7), materials, levels=NEAR),
+            blob(centre, 0.94 * radius, greens[-1], materials, levels=MID, rough=0.2),
+            leaves(centre, radius, materials, count=44, size=0.3, materials=greens),
         ]
     )
 
 
 def hedge(materials: TownMaterials, material: int) -> TrianglePiece:
     """A metre of hedge along x, 0.7 m thick and 1 m tall; scale it."""
-    rng = materials.generator
-    light_green = materials.palette.shade(material, 1.5)
-    parts = [box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), material, levels=VISIBLE)]
-    leaf_count = 15
+    greens = [materials.palette.shade(material, factor) for factor in (1.6, 1.0, 0.75)]
+    return join(
+        [
+            box((-0.52, -0.29, -0.1), (0.52, 0.29, 0.93), greens[2], levels=NEAR),
+            box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), material, levels=MID),
+            _hedge_leaves(materials.generator, 15, (0.12, 0.13), greens),
+            _hedge_leaves(materials.details, 18, (0.08, 0.17), greens),
+        ]
+    )
+
+
+def _hedge_leaves(
+    rng: np.random.Generator, count: int, half_size: tuple[float, float], greens: list[int]
+) -> TrianglePiece:
+    """Leaf cards on both sides and, each third of them, on the top of a metre of hedge."""
     centres = np.column_stack(
-        [rng.uniform(-0.5, 0.5, leaf_count), rng.choice([-0.34, 0.34], leaf_count), rng.uniform(0.05, 1.0, leaf_count)]
+        [rng.uniform(-0.54, 0.54, count), rng.choice([-0.33, 0.33], count), rng.uniform(0.02, 1.0, count)]
     )
-    centres[::3, 1], centres[::3, 2] = rng.uniform(-0.33, 0.33, len(centres[::3])), 0.98
-    outwards = np.column_stack([np.zeros(leaf_count), np.sign(centres[:, 1]), np.zeros(leaf_count)])
+    outwards = np.column_stack([np.zeros(count), np.sign(centres[:, 1]), np.zeros(count)])
+    centres[::3, 1], centres[::3, 2] = rng.uniform(-0.33, 0.33, len(centres[::3])), 0.97
     outwards[::3] = 0.0, 0.0, 1.0
-    leaf_normals = outwards + 0.5 * rng.normal(size=(leaf_count, 3))
+    leaf_normals = outwards + 0.55 * rng.normal(size=(count, 3))
     leaf_normals /= np.linalg.norm(leaf_normals, axis=1, keepdims=True)
-    side_axes = cross(leaf_normals, [0.3, 0.2, 0.9])
-    leaf_materials = np.where(rng.random(leaf_count) < 0.5, light_green, material)
-    parts.append(
-        _leaf_triangles(
-            centres, leaf_normals, side_axes, 0.12, (0.0, 2.1, 4.2), np.repeat(outwards, 3, axis=0), leaf_materials
-        )
-    )
-    return join(parts)
+    leaf_normals *= np.sign((leaf_normals * outwards).sum(axis=1, keepdims=True) + 1e-9)
+    # Leaves near the top catch more light.
+    shade = 2.2 * (1.0 - centres[:, 2]) + 1.6 * (rng.random(count) - 0.5)
+    turns = np.arange(count)[:, None]
+    side_axes = cross(leaf_normals, np.hstack([np.sin(turns), np.cos(turns), 0.9 + 0.0 * turns]))
+    half_sizes = np.linspace(*half_size, count)[:, None, None]
+    shading = outwards + 0.4 * leaf_normals
+    colours = np.array(greens)[np.clip(shade.astype(int), 0, len(greens) - 1)]
+    return _leaf_cards(centres, leaf_normals, side_axes, half_sizes, shading, colours)
+
+
+def tuft(materials: TownMaterials) -> TrianglePiece:
+    """Blades of grass about 0.2 m tall that lean outwards."""
+    rng = materials.details
+    count = 4
+    angles = 2.0 * np.pi * (np.arange(count) + rng.uniform(0.0, 0.8, count)) / count
+    directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+    across = np.column_stack([-np.sin(angles), np.cos(angles), np.zeros(count)])
+    feet = rng.uniform(0.0, 0.12, (count, 1)) * directions
+    width, height = rng.uniform(0.03, 0.06, (count, 1)), rng.uniform(0.10, 0.24, (count, 1))
+    tips = feet + rng.uniform(0.3, 0.8, (count, 1)) * height * directions + [0.0, 0.0, 1.0] * height
+    corners = np.stack([feet - width * across, tips, feet + width * across], axis=1)
+    # Level normals: grass has the brightness of the ground around it.
+    normals = np.broadcast_to([0.0, 0.0, 1.0], (3 * count, 3))
+    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    return smooth(corners.reshape(-1, 3), faces, normals, rng.choice(materials.blades, count), levels=NEAR)

@@ -16,8 +16,11 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
-UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs")
-"""Unselected traffic, for rates and past stop signs. The name of a scenario class does not load these scenarios."""
+UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs", "lane-keeping")
+"""Unselected traffic, for rates and past stop signs, and marked roads without traffic.
+
+The name of a scenario class does not load these scenarios.
+"""
 UNIFORM = ("natural-uniform",)
 """Former set `natural`, to which earlier results refer: uniform drivers, no walkers and no cyclists."""
 TRAINING = ("training", "training-lanes")

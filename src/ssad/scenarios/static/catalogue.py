@@ -39,6 +39,15 @@ FAMILIES: Final = ("shift", "digital", "texture", "light", "fault")
 """Families of SSAD; a perturbation of your own may be of any other."""
 SPELLINGS: Final = {"attack": "digital", "perturbation": "own"}  # keys of an entry beside the families themselves
 GROUPS: Final = {"shift": "shift", "digital": "attack", "light": "light", "fault": "fault", "own": "perturbation"}
+STREET: Final = "ssad.scenarios.static.physical.street"
+OWN: Final[dict[str, str]] = {
+    "dirty-road": f"{STREET}.dirty_road:DirtyRoad",
+    "phantom": f"{STREET}.phantom:Phantom",
+    "lens-light": f"{STREET}.lens_light:LensLight",
+    "sign-change": f"{STREET}.signs:SignChange",
+    "head-light": f"{STREET}.signs:HeadLight",
+}
+"""Perturbations of SSAD that name their family themselves, as those of packages do."""
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that a digital attack may move a pixel by, by severity
 # Attacks that take five gradient steps unless a suite sets them: two steps of 16 code values change nothing on YOLOv5n.
 STEPPED: Final = ("pgd", "cw", "momentum", "apgd")
@@ -267,11 +276,11 @@ class UserEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True for a class with an argument `severity`."""
-        return _takes_severity("perturbation", self.name)
+        return _takes_severity("perturbation", self.name, OWN)
 
     def make(self, severity: int) -> Perturbation:
         """Return the perturbation at a severity."""
-        perturbation = _make_object("perturbation", self.name, self.options, severity, ("name", "family"))
+        perturbation = _make_object("perturbation", self.name, self.options, severity, ("name", "family"), OWN)
         if not isinstance(perturbation, Perturbation):
             raise ConfigError(
                 f"perturbation '{self.name}': of type {type(perturbation).__name__}, which does not derive from "
@@ -429,7 +438,7 @@ def _registered(search_path: tuple[str, ...]) -> Mapping[str, str]:
         names |= dict.fromkeys(offered_names(f"ssad.{group}s"), family)
     names |= dict.fromkeys((*CONTROLS, *shipped_textures()), "texture")
     names |= dict.fromkeys((name for name in ATTACKS if not needs(name)), "digital")
-    names |= dict.fromkeys((NIGHT, *LIGHTS), "light")
+    names |= dict.fromkeys((NIGHT, *LIGHTS), "light") | dict.fromkeys(OWN, "own")
     return MappingProxyType(names | dict.fromkeys(FAULTS, "fault") | dict.fromkeys(KNOWN, "shift"))
 
 
@@ -504,20 +513,25 @@ def is_path(name: str) -> bool:
     return any((folder / card_name).is_file() for card_name in ("light.json", "texture.json"))
 
 
-def _make_object(
-    kind: str, name: str, options: Mapping[str, Any], severity: int, required_attributes: tuple[str, ...]
+def _make_object(  # noqa: PLR0917  # plain values
+    kind: str,
+    name: str,
+    options: Mapping[str, Any],
+    severity: int,
+    required_attributes: tuple[str, ...],
+    built_in: Mapping[str, str] = MappingProxyType({}),
 ) -> Any:
-    """Return an object of the user's own, made with its options, and with the severity if it takes one."""
-    factory = resolve(kind, {}, name)
+    """Return an object of its own family, made with its options, and with the severity if it takes one."""
+    factory = resolve(kind, built_in, name)
     arguments = dict(options)
-    if _takes_severity(kind, name):
+    if _takes_severity(kind, name, built_in):
         arguments["severity"] = severity
     return make(kind, name, factory, arguments, required_attributes)
 
 
-def _takes_severity(kind: str, name: str) -> bool:
-    """Return True if a class or function of the user's own has an argument `severity`."""
-    factory = resolve(kind, {}, name)
+def _takes_severity(kind: str, name: str, built_in: Mapping[str, str] = MappingProxyType({})) -> bool:
+    """Return True if a class or function has an argument `severity`."""
+    factory = resolve(kind, built_in, name)
     if not callable(factory):
         return False
     try:

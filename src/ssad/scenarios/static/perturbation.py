@@ -176,6 +176,11 @@ class Perturbation:
         return False
 
     @property
+    def needs_place(self) -> bool:
+        """True if it is on something along the route of the ego: episodes to which it does not apply are left out."""
+        return False
+
+    @property
     def target(self) -> str:
         """Target that it is made for, as for `ssad record --target`; "" for a perturbation of sensors."""
         return ""

@@ -1,7 +1,8 @@
 """Dirty road patch: dirt on the road that leads a lane keeper out of its lane, and its controls.
 
-Source: Sato et al., Dirty Road Can Attack: Security of Deep Learning based Automated Lane Centering under Physical-World
-Attack (USENIX Security 2021): a grey patch in the lane that looks like dirt, between the lines, which stay visible.
+Source: Sato et al., Dirty Road Can Attack: Security of Deep Learning based Automated Lane Centering under
+Physical-World Attack (USENIX Security 2021): a grey patch in the lane that looks like dirt, between the lines, which
+stay visible.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ LENGTH: Final = 24.0  # m along the road
 WIDE: Final = 5.2  # m across the road: it covers the lines of the lane
 NARROW: Final = 2.9  # m: it lies between them
 SHIPPED_PATCHES: Final = {name: Path(__file__).parent / "trained" / f"{name}.json" for name in ("over", "between")}
-PATTERNS: Final = (*SHIPPED_PATCHES, "random", "clean")
+PATTERNS: Final = (*SHIPPED_PATCHES, "shuffled", "random", "clean")
 EDGE: Final = 20.0  # m of the route that must lie before and behind a place
 
 
@@ -55,12 +56,13 @@ class DirtyRoad(Perturbation):
 
     Attributes:
         pattern: Trained against the lane keeper: "over", which covers the lines of the lane, or "between" them, as in
-            the source. A control: "random" dirt of the same greys, or "clean", an even patch as dark as the road. Or
-            the path of a card (NAME.json beside NAME.png).
+            the source. A control: "shuffled", the texels of "over" in random order; "random" dirt over the whole range
+            of greys, which is far stronger; or "clean", an even patch as dark as the road. Or the path of a card
+            (NAME.json beside NAME.png).
         distance: Place of its middle along the route, m.
         width: m across the road, of a control.
         mirrored: Whether left and right are exchanged: it then leads to the other side.
-        seed: Seed of random dirt.
+        seed: Seed of the order, and of random dirt.
 
     Raises:
         ConfigError: There is no such pattern, or the distance is below 0.
@@ -104,7 +106,8 @@ class DirtyRoad(Perturbation):
         """Return the hash of the trained patch; "" for the controls."""
         if self.pattern in ("random", "clean"):
             return ""
-        return load_texture(_card_path(self.pattern))[1].hash[:12]
+        pattern = "over" if self.pattern == "shuffled" else self.pattern
+        return load_texture(_card_path(pattern))[1].hash[:12]
 
     def albedo(self) -> Tensor:
         """Return the linear albedo [3, H, W]: rows from the far edge to the near one, columns from left to right."""
@@ -114,6 +117,10 @@ class DirtyRoad(Perturbation):
         elif self.pattern == "random":
             values = generator("dirty road", self.seed).uniform(*DIRT, cells)
             grey = torch.from_numpy(values.astype(np.float32))
+        elif self.pattern == "shuffled":
+            trained = _load_patch("over")
+            order = generator("dirty road order", self.seed).permutation(trained.numel())
+            grey = trained.flatten()[torch.from_numpy(order)].reshape(trained.shape)
         else:
             grey = _load_patch(self.pattern)
         grey = grey.flip(1) if self.mirrored else grey
@@ -129,7 +136,7 @@ class DirtyRoad(Perturbation):
         return EGO if has_place(episode, self.distance) else None
 
     @property
-    def needs_target(self) -> bool:
+    def needs_place(self) -> bool:
         """True: the route must pass its place."""
         return True
 

@@ -56,7 +56,7 @@ PICTURES: Final = {
 }
 BLANK: Final = "blank"
 SURFACES: Final = ("road", "screen")
-LUMENS: Final = (500.0, 1500.0, 5000.0, 15000.0, 50000.0)  # of a white picture, by severity
+LUMENS: Final = (20.0, 60.0, 200.0, 600.0, 2000.0)  # of a white picture, by severity; pocket projectors have 100
 TEXELS: Final = 96  # along the longer side of a picture
 STRETCH: Final = 4.0  # times: a picture on the road is longer, so that it looks less flat from the ego
 SCREEN_WIDTH, SCREEN_HEIGHT = 2.4, 2.4  # m
@@ -119,7 +119,7 @@ class Phantom(Perturbation):
         return self.distance
 
     @property
-    def needs_target(self) -> bool:
+    def needs_place(self) -> bool:
         """True: the route must pass its place."""
         return True
 
@@ -157,7 +157,7 @@ class Phantom(Perturbation):
             pose = first_array(aimed_poses(*(torch.tensor([values], dtype=torch.float64) for values in positions)))
             reach = PROJECTOR[0]
         spread = (0.5 * width / reach, 0.5 * height / reach)
-        lamp = SceneLamp(pose, self.flux, spread, square=True, texture=0, shadows=False)
+        lamp = SceneLamp(pose, self.flux, spread, square=True, texture=0)
         return SceneEdit(lamps=(lamp,), textures={0: self.light()})
 
     def street_edit(self) -> StreetEdit:
@@ -211,10 +211,10 @@ def screen_mesh() -> Mesh:
     """Return a board that faces against x, with its foot on the ground."""
     half, thickness = 0.5 * SCREEN_WIDTH, 0.04
     front = np.array([(0, half, 0), (0, -half, 0), (0, -half, SCREEN_HEIGHT), (0, half, SCREEN_HEIGHT)], np.float64)
-    back = front + [thickness, 0.0, 0.0]
+    back = front + np.array([thickness, 0.0, 0.0])
     points = np.concatenate([front, back])
     quads = [(0, 3, 2, 1), (4, 5, 6, 7), (3, 7, 6, 2), (0, 4, 7, 3), (1, 2, 6, 5)]
-    faces = np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (a, d, c))])
     return build_mesh(points, faces, materials=SCREEN, smooth=0.0)
 
 

@@ -84,7 +84,7 @@ def painted_scene(
     return PerturbedScene(load)
 
 
-def paint_road(
+def paint_road(  # noqa: PLR0917  # plain values
     image: U8,
     camera: Camera,
     ego_to_world: F64,
@@ -124,7 +124,10 @@ def paint_road(
     # Pixel centres lie at half numbers in the image, at whole numbers in OpenCV.
     homography = cv2.getPerspectiveTransform(source - 0.5, pixels - 0.5)
     frame_size = (image.shape[1], image.shape[0])
-    warped = cv2.warpPerspective(texture, homography, frame_size, flags=cv2.INTER_LINEAR)
+    # Beyond its edge the texture goes on, and its opacity ends.
+    warped = cv2.warpPerspective(
+        texture, homography, frame_size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     share = cv2.warpPerspective(opacity.astype(np.float32), homography, frame_size, flags=cv2.INTER_LINEAR)
     for outline in hidden:
         cv2.fillConvexPoly(share, np.rint(outline).astype(np.int32), 0.0)
