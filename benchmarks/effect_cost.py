@@ -1,9 +1,9 @@
 """Cost of the effects of the rendering: python benchmarks/effect_cost.py [--effects NAME,...] [--out FILE]
 
 The street of `camera_speed.py` by day, with a low sun ahead, on a wet road and at night, 640 x 640 and 640 x 384
-pixels, on one core. A picture without any effect and one with an effect are rendered in turn; the cost is the median of the
-differences in process time, so that a busy machine slows both alike. `finish` is metallic paint, dirt and wear on all
-vehicles. The camera does not move: the first picture makes the probe of `reflections`, and the others share it.
+pixels, on one core. A picture without any effect and one with an effect are rendered in turn; the cost is the median
+of the differences in process time, so that a busy machine slows both alike. `finish` is metallic paint, dirt and wear
+on all vehicles. The camera does not move: the first picture makes the probe of `reflections`, and the others share it.
 """
 
 from __future__ import annotations
