@@ -60,7 +60,7 @@ def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> PositionInLane:
     direction = directions[nearest_segment]
     deviation = direction[:, 0] * chosen_offset[:, 1] - direction[:, 1] * chosen_offset[:, 0]
     route_yaw = np.arctan2(direction[:, 1], direction[:, 0])
-    heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - route_yaw))
+    heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - route_yaw), np.float64)
     return PositionInLane(
         deviation,
         heading,
@@ -76,7 +76,7 @@ def _widths(graph: LaneGraph, points: F64) -> F64:
     is_near = np.hypot(*(lane_points - points.mean(0)).T) < np.hypot(*(points - points.mean(0)).T).max() + 20.0
     lane_points, widths = lane_points[is_near], widths[is_near]
     nearest = [int(np.square(lane_points - point).sum(1).argmin()) for point in points]
-    return widths[nearest]
+    return np.asarray(widths[nearest], np.float64)
 
 
 def is_outside(position: PositionInLane, length: float, width: float) -> Bool:

@@ -76,7 +76,7 @@ class LaneFilter:
 
     def held(self) -> PerceivedLane | None:
         """Return the predicted lane, without confidence; None as long as none was found."""
-        return None if self.state is None else PerceivedLane(*self.state.tolist(), 0.0)
+        return None if self.state is None else _lane_of(self.state, 0.0)
 
     def correct(self, strength: F32) -> PerceivedLane | None:
         """Correct the lane with the markings of an image.
@@ -115,7 +115,13 @@ class LaneFilter:
             self.state = prior
         else:
             self.covariance = 0.5 * (covariance + covariance.T)
-        return PerceivedLane(*self.state.tolist(), confidence)
+        return _lane_of(self.state, confidence)
+
+
+def _lane_of(state: F64, confidence: float) -> PerceivedLane:
+    """Return the lane of a state [4]."""
+    offset, heading, curvature, width = state.tolist()
+    return PerceivedLane(offset, heading, curvature, width, confidence)
 
 
 def line_places(strength: F32, grid: RoadGrid, line: F64, window: float) -> tuple[F64, F64]:
