@@ -1,9 +1,10 @@
 """Cost of the effects of the rendering: python benchmarks/effect_cost.py [--effects NAME,...] [--out FILE]
 
-The street of `camera_speed.py` by day, with a low sun ahead and on a wet road, 640 x 640 and 640 x 384 pixels, on one
-core. A picture without any effect and one with an effect are rendered in turn; the cost is the median of the
-differences in process time, so that a busy machine slows both alike. `finish` is metallic paint, dirt and wear on all
-vehicles. The camera does not move: the first picture makes the probe of `reflections`, and the others share it.
+The street of `camera_speed.py` by day, with a low sun ahead, on a wet road and at night with braking and turning
+vehicles, 640 x 640 and 640 x 384 pixels, on one core. A picture without any effect and one with an effect are rendered
+in turn; the cost is the median of the differences in process time, so that a busy machine slows both alike. `finish` is
+metallic paint, dirt and wear on all vehicles. The camera does not move: the first picture makes the probe of
+`reflections`, and the others share it.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from camera_speed import scene
 
-from ssad.core.frames import Camera
+from ssad.core.frames import FORWARD, Camera
 from ssad.rendering.camera.effects import EFFECTS, NO_EFFECTS, select_effects
-from ssad.rendering.camera.render import RenderQuality, View, render
-from ssad.rendering.camera.scene import Finish, RenderScene
+from ssad.rendering.camera.lamps import own_lamps
+from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, render
+from ssad.rendering.camera.scene import Finish, LampSignal, RenderScene
 
 FINISH = Finish(metallic=0.5, dirt=0.5, wear=0.5)
 
@@ -50,16 +52,26 @@ def cost(base: Callable[[], object], changed: Callable[[], object], repeats: int
 
 
 def views_of(view: View) -> dict[str, View]:
-    """Return the view at 640 x 640 and at 640 x 384, by day, with a low sun ahead, and on a wet road."""
+    """Return the view at 640 x 640 and at 640 x 384, by day, with a low sun ahead, on a wet road and at night."""
     heading = float(np.arctan2(view.pose[1, 2], view.pose[0, 2]))
     low = replace(view.weather, sun_height=0.15, sun_heading=heading + 0.1)
     wet = replace(view.weather, wet=0.8, clouds=0.8)
     wide = Camera.typical(640, 384)
+    dark = SceneWeather(-0.15, 0.9)
+    signals = int(LampSignal.BRAKE | LampSignal.LEFT)
+    night = replace(
+        view,
+        weather=dark,
+        lamps=own_lamps(view.pose @ np.linalg.inv(FORWARD), dark),
+        objects=tuple(replace(scene_object, signals=signals) for scene_object in view.objects),
+    )
     return {
         "640 x 640": view,
         "640 x 384": replace(view, camera=wide),
         "640 x 640, low sun": replace(view, weather=low),
         "640 x 640, wet": replace(view, weather=wet),
+        "640 x 640, night": night,
+        "640 x 384, night": replace(night, camera=wide),
     }
 
 

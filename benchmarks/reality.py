@@ -23,15 +23,16 @@ import torch
 
 import ssad
 from benchmarks.insert import DOCS
-from ssad.core.checkpoints import read_card
+from ssad.core.checkpoints import state_hash
 from ssad.core.safeio import dump_json
-from ssad.detectors import SHIPPED
+from ssad.detectors import SHIPPED, make_detector
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "reality.json"
 LOG = ROOT / "benchmarks" / "results" / "reality-log.jsonl"
 PAGE = DOCS / "results" / "reality.md"
-FLAT, SOLID = ("yolov5n", "yolov3-tiny"), ("fcos3d-light", "fcos3d-light-robust", "pgd-det-light")
+FLAT = ("yolov5n", "yolov3-tiny")
+SOLID = ROOT / "benchmarks" / "reality-solid.yaml"
 PHOTO = "centernet-photo"
 PROBE = ("yolov5n", "adv-patch-yolov5n-twinford")
 TITLES = {"recall": "recall", "precision": "precision", "AP50": "AP50", "margin": "margin"}
@@ -50,12 +51,11 @@ def measure(data: Path, archive: Path | None, name: str, out: Path) -> None:
     identity: Mapping[str, Any] = {}
     weights: dict[str, str] = {}
     # Textures are made for 2D detectors; 3D ones are shown the clean photographs.
-    for part, detectors, changes in (("flat", flat, {}), ("solid", SOLID, {"textures": []})):
-        settings = {"data": str(data), "detectors": list(detectors), **changes}
-        results = ssad.run("reality", set=settings, out=out / part, workers=1)
+    for suite, changes in (("reality", {"detectors": flat}), (str(SOLID), {})):
+        results = ssad.run(suite, set={"data": str(data), **changes}, out=out / Path(suite).stem, workers=1)
         records += [row for row in results.rows if row["status"] == "ok"]
-        identity = results.header["inputs"]["data"]
-        weights |= {key.rpartition("@")[2]: value for key, value in results.header["inputs"]["weights"].items()}
+        identity = results.header["data"]
+        weights |= {key.rpartition("@")[2]: value for key, value in results.header["weights"].items()}
     stored = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     entry = {
         "data": dict(identity),
@@ -122,7 +122,7 @@ def part_table(entry: Mapping[str, Any], kind: str) -> list[str]:
     names = list(dict.fromkeys(part["name"] for row in rows for part in row["parts"] if part["by"] == kind))
     heads = [f"`{row['detector']}`" for row in rows]
     lines = [
-        f"| {kind.capitalize()} | {' | '.join(f'{head} recall, % | AP50, %' for head in heads)} |",
+        f"| {kind.capitalize()} | {' | '.join(f'{head} recall, % (objects) | AP50, %' for head in heads)} |",
         "|---|" + "---:|---:|" * len(rows),
     ]
     for name in names:
@@ -132,7 +132,7 @@ def part_table(entry: Mapping[str, Any], kind: str) -> list[str]:
             cells += (
                 ["", ""]
                 if part is None
-                else [f"{number(part, 'recall').split()[0]} of {part['n']}", number(part, "AP50").split()[0]]
+                else [f"{number(part, 'recall').split()[0]} ({part['n']})", number(part, "AP50").split()[0]]
             )
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return lines
@@ -254,7 +254,9 @@ def write_page() -> None:
         insert_sentence(page, "photographs", quotation(first, folder))
     for row in clean_rows(first):
         card = SHIPPED / f"{row['detector']}.json"
-        if card.is_file() and read_card(card).hash.startswith(first["weights"][row["detector"]].split()[0]):
+        measured = first["weights"][row["detector"]].split()[0]
+        # Figures of other weights say nothing about these.
+        if card.is_file() and state_hash(make_detector(row["detector"])) == measured:
             content = json.loads(card.read_text())
             figures = {name: row["metrics"][name] for name in (*TITLES, "wrong")} | {"objects": row["n"]}
             content["photographs"] = {name: value for name, value in figures.items() if value is not None}

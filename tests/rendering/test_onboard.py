@@ -419,9 +419,13 @@ class Brakes(Watcher):
 class Follower(Onboard):
     """Keeps the moments that it shows."""
 
+    def __init__(self, **options) -> None:
+        super().__init__(**options)
+        self.moments: list[AgentPoses] = []
+
     def agent_views(self, simulator, agents):
         views = super().agent_views(simulator, agents)
-        self.moments = [*getattr(self, "moments", []), views[0].moment] if views else self.moments
+        self.moments += [view.moment for view in views]
         return views
 
 

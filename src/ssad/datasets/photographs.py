@@ -113,7 +113,7 @@ class PhotographSet:
         if count <= limit:
             return self
         rows = [index * count // limit for index in range(limit)]
-        return replace(self, photographs=tuple(self.photographs[row] for row in rows))
+        return replace(self, photographs=tuple(self.photographs[object_row] for object_row in rows))
 
 
 def class_of(name: str) -> str:
@@ -141,9 +141,9 @@ def read_photographs(path: Path, split: str = "") -> PhotographSet:
         raise ConfigError(f"{path}: no such folder; give a folder of annotated photographs")
     if any(path.glob("*/sample.json")):
         return _read_nuscenes(path, split)
-    for root in (path, path / "training"):
-        if (root / "image_2").is_dir():
-            return _read_kitti(root, split)
+    for kitti_root in (path, path / "training"):
+        if (kitti_root / "image_2").is_dir():
+            return _read_kitti(kitti_root, split)
     annotations = _annotation_files(path, split)
     if not annotations:
         raise ConfigError(
@@ -160,14 +160,18 @@ def _annotation_files(folder: Path, split: str) -> list[Path]:
         if not files:
             continue
         if pattern == "*.json":
-            return [file for file in files if not split or split in file.stem]
-        matching = [file for file in files if split and (file.stem == split or file.stem.endswith(f"_{split}"))]
+            return [image_file for image_file in files if not split or split in image_file.stem]
+        matching = [
+            image_file
+            for image_file in files
+            if split and (image_file.stem == split or image_file.stem.endswith(f"_{split}"))
+        ]
         # Of COCO's files of a split, those of objects: captions and keypoints are beside them.
-        matching = [file for file in matching if file.stem.startswith("instances_")] or matching
+        matching = [image_file for image_file in matching if image_file.stem.startswith("instances_")] or matching
         candidates = matching or ([] if split else files)
         if len(candidates) == 1:
             return candidates
-        names = ", ".join(file.relative_to(folder).as_posix() for file in files[:8])
+        names = ", ".join(image_file.relative_to(folder).as_posix() for image_file in files[:8])
         problem = f"no split '{split}'" if split and not candidates else "several files of annotations"
         raise ConfigError(f"{folder}: {problem} ({names}); name one as the split, or give the file")
     return []
@@ -175,9 +179,9 @@ def _annotation_files(folder: Path, split: str) -> list[Path]:
 
 def _read_json_files(files: Sequence[Path], split: str) -> PhotographSet:
     """Read files of one form; only lists of photographs may be several."""
-    sets = [_read_json_file(file, split) for file in files]
+    sets = [_read_json_file(image_file, split) for image_file in files]
     if len({photographs.form for photographs in sets}) > 1 or (len(sets) > 1 and sets[0].form != "list"):
-        names = ", ".join(file.name for file in files)
+        names = ", ".join(image_file.name for image_file in files)
         raise ConfigError(f"{files[0].parent}: several files of annotations ({names}); give one of them")
     report = ImportReport(str(files[0]) if len(files) == 1 else str(files[0].parent))
     for photographs in sets:
@@ -218,8 +222,8 @@ def _read_coco(path: Path, content: Any, report: ImportReport) -> PhotographSet:
     photographs = []
     for image in data.images:
         names = [
-            IGNORED if crowd and classes[label] else classes[label]
-            for label, crowd in zip(image.label, image.crowd, strict=True)
+            IGNORED if crowd and classes[label_entry] else classes[label_entry]
+            for label_entry, crowd in zip(image.label, image.crowd, strict=True)
         ]
         name = image.file.relative_to(images or image.file.parent).as_posix()
         photographs.append(_photograph(name, image.file, (image.width, image.height), names, image.box))
@@ -262,48 +266,48 @@ def _read_bdd100k(path: Path, entries: Sequence[Any], split: str, report: Import
     photographs = []
     for entry in entries:
         name = str(entry["name"])
-        labels = [label for label in entry.get("labels") or [] if label.get("box2d") is not None]
-        boxes = [[label["box2d"][side] for side in ("x1", "y1", "x2", "y2")] for label in labels]
+        labels = [label_entry for label_entry in entry.get("labels") or [] if label_entry.get("box2d") is not None]
+        boxes = [[label_entry["box2d"][side] for side in ("x1", "y1", "x2", "y2")] for label_entry in labels]
         images = next((candidate for candidate in candidates if (candidate / name).is_file()), candidates[0])
-        file = data_path(folder, (images / name).relative_to(folder))
-        names = [class_of(str(label["category"])) for label in labels]
-        photographs.append(_photograph(name, file, (0, 0), names, boxes))
+        image_file = data_path(folder, (images / name).relative_to(folder))
+        names = [class_of(str(label_entry["category"])) for label_entry in labels]
+        photographs.append(_photograph(name, image_file, (0, 0), names, boxes))
     classes = ("car", "truck", "bus", "bicycle", "motorcycle", "pedestrian", "traffic_light")
     return _of("bdd100k", photographs, classes, report)
 
 
-def _read_kitti(root: Path, split: str) -> PhotographSet:
+def _read_kitti(kitti_root: Path, split: str) -> PhotographSet:
     """Read KITTI's object benchmark: image_2, label_2 and, for 3D detectors, calib."""
-    report = ImportReport(str(root))
+    report = ImportReport(str(kitti_root))
     numbers = None
     if split:
         path = next(
             (
                 folder / "ImageSets" / f"{split}.txt"
-                for folder in (root, root.parent)
+                for folder in (kitti_root, kitti_root.parent)
                 if (folder / "ImageSets" / f"{split}.txt").is_file()
             ),
             None,
         )
         if path is None:
-            raise ConfigError(f"{root}: no split '{split}': there is no ImageSets/{split}.txt")
+            raise ConfigError(f"{kitti_root}: no split '{split}': there is no ImageSets/{split}.txt")
         numbers = set(safeio.read_text(path).split())
     photographs = []
-    for file in sorted((root / "image_2").iterdir()):
-        if file.suffix.lower() not in IMAGE_SUFFIXES or (numbers is not None and file.stem not in numbers):
+    for image_file in sorted((kitti_root / "image_2").iterdir()):
+        if image_file.suffix.lower() not in IMAGE_SUFFIXES or (numbers is not None and image_file.stem not in numbers):
             continue
-        labels = data_path(root, f"label_2/{file.stem}.txt")
+        labels = data_path(kitti_root, f"label_2/{image_file.stem}.txt")
         if not labels.is_file():
-            report.omit("photographs without a file in label_2", file.name)
+            report.omit("photographs without a file in label_2", image_file.name)
             continue
-        photographs.append(_kitti_photograph(root, data_path(root, f"image_2/{file.name}"), labels))
+        photographs.append(_kitti_photograph(kitti_root, data_path(kitti_root, f"image_2/{image_file.name}"), labels))
     if not photographs:
-        raise ConfigError(f"{root}: no photograph of image_2 has a file in label_2")
+        raise ConfigError(f"{kitti_root}: no photograph of image_2 has a file in label_2")
     return _of("kitti", photographs, ("car", "truck", "pedestrian"), report)
 
 
-def _kitti_photograph(root: Path, file: Path, labels: Path) -> Photograph:
-    intrinsic, offset = _kitti_camera(data_path(root, f"calib/{file.stem}.txt"))
+def _kitti_photograph(kitti_root: Path, image_file: Path, labels: Path) -> Photograph:
+    intrinsic, offset = _kitti_camera(data_path(kitti_root, f"calib/{image_file.stem}.txt"))
     names, boxes, solids = [], [], []
     for number, line in enumerate(safeio.read_text(labels).splitlines(), 1):
         words = line.split()
@@ -320,7 +324,7 @@ def _kitti_photograph(root: Path, file: Path, labels: Path) -> Photograph:
         height, width, length, x, y, z, yaw = values[7:14]
         has_solid = intrinsic is not None and height > 0 and z > 0
         solids.append((x + offset, y - height / 2, z, length, height, width, yaw) if has_solid else NO_SOLID)
-    return _photograph(file.name, file, (0, 0), names, boxes, solids=solids, intrinsic=intrinsic)
+    return _photograph(image_file.name, image_file, (0, 0), names, boxes, solids=solids, intrinsic=intrinsic)
 
 
 def _kitti_camera(path: Path) -> tuple[F64 | None, float]:
@@ -339,10 +343,10 @@ def _kitti_camera(path: Path) -> tuple[F64 | None, float]:
     raise FormatError(f"{path}: no projection P2 of twelve numbers")
 
 
-def _read_nuscenes(root: Path, split: str) -> PhotographSet:
+def _read_nuscenes(kitti_root: Path, split: str) -> PhotographSet:
     """Read the key images of all cameras of a data set in the nuScenes schema."""
     photographs = []
-    with NuScenes(root) as data:
+    with NuScenes(kitti_root) as data:
         report = data.report()
         scenes = scenes_of(data, split) if split else tuple(scene.name for scene in data.scenes())
         for name in scenes:
@@ -352,7 +356,7 @@ def _read_nuscenes(root: Path, split: str) -> PhotographSet:
                     continue
                 truth = camera_truth(frame, scene.annotations(frame.sample_token))
                 assert truth.solid is not None
-                solid = np.concatenate(
+                solid_boxes = np.concatenate(
                     [
                         truth.solid.centre.double().numpy(),
                         truth.solid.size_lhw.double().numpy(),
@@ -363,11 +367,11 @@ def _read_nuscenes(root: Path, split: str) -> PhotographSet:
                 photographs.append(
                     Photograph(
                         frame.filename,
-                        nuscenes_path(root, frame.filename),
+                        nuscenes_path(kitti_root, frame.filename),
                         (frame.width, frame.height),
                         truth.box.double().numpy(),
                         truth.label.numpy().astype(np.int32),
-                        solid,
+                        solid_boxes,
                         frame.intrinsic,
                     )
                 )
@@ -376,7 +380,7 @@ def _read_nuscenes(root: Path, split: str) -> PhotographSet:
 
 def _photograph(
     name: str,
-    file: Path,
+    image_file: Path,
     size: tuple[int, int],
     names: Sequence[str],
     boxes: Iterable[Any],
@@ -385,21 +389,21 @@ def _photograph(
     intrinsic: F64 | None = None,
 ) -> Photograph:
     """Return a photograph with its objects that have a class or are ignored. ValueError: a broken box."""
-    rows = [row for row, class_name in enumerate(names) if class_name]
+    rows = [object_row for object_row, class_name in enumerate(names) if class_name]
     box = np.array([list(entry) for entry in boxes], np.float64).reshape(-1, 4)
-    solid = np.array([list(entry) for entry in solids or [NO_SOLID] * len(names)], np.float64).reshape(-1, 7)
-    if len(box) != len(names) or len(solid) != len(names):
+    solid_boxes = np.array([list(entry) for entry in solids or [NO_SOLID] * len(names)], np.float64).reshape(-1, 7)
+    if len(box) != len(names) or len(solid_boxes) != len(names):
         raise ValueError(f"{name}: {len(names)} objects, {len(box)} boxes")
     if not np.isfinite(box).all() or (box[:, 2:] <= box[:, :2]).any():
         raise ValueError(f"{name}: a box without width or height, or not finite")
-    labels = [CLASSES.index(names[row]) if names[row] != IGNORED else -1 for row in rows]
-    return Photograph(name, file, size, box[rows], np.array(labels, np.int32), solid[rows], intrinsic)
+    labels = [CLASSES.index(names[object_row]) if names[object_row] != IGNORED else -1 for object_row in rows]
+    return Photograph(name, image_file, size, box[rows], np.array(labels, np.int32), solid_boxes[rows], intrinsic)
 
 
 def _named_classes(photographs: Sequence[Photograph]) -> list[str]:
     """Return the classes that occur in photographs, of a form that lists none."""
-    labels = {int(label) for photograph in photographs for label in photograph.label if label >= 0}
-    return [CLASSES[label] for label in sorted(labels)]
+    labels = {int(label_entry) for photograph in photographs for label_entry in photograph.label if label_entry >= 0}
+    return [CLASSES[label_entry] for label_entry in sorted(labels)]
 
 
 def _of(form: Form, photographs: Sequence[Photograph], classes: Iterable[str], report: ImportReport) -> PhotographSet:

@@ -65,29 +65,37 @@ class BoxCounts:
         is_found = self.matched.hit
         is_counted = (self.score >= self.threshold) & ~self.matched.ignored
         truth = float((self.truth @ weights).sum())
-        hits, boxes = (float(repetitions[rows].sum()) for rows in (is_found & is_counted, is_counted))
+        hit_count, boxes = (
+            float(repetitions[row_indices].sum()) for row_indices in (is_found & is_counted, is_counted)
+        )
         total_score = float((self.score * repetitions)[is_found].sum())
-        rows = np.repeat(np.arange(len(repetitions)), repetitions)
+        row_indices = np.repeat(np.arange(len(repetitions)), repetitions)
         resampled = Matched2D(
-            self.matched.label[rows], self.matched.hit[rows], self.matched.ignored[rows], self.truth @ weights
+            self.matched.label[row_indices],
+            self.matched.hit[row_indices],
+            self.matched.ignored[row_indices],
+            self.truth @ weights,
         )
         precisions = resampled.average_precision()
         return {
-            "recall": hits / truth if truth else np.nan,
-            "precision": hits / boxes if boxes else np.nan,
+            "recall": hit_count / truth if truth else np.nan,
+            "precision": hit_count / boxes if boxes else np.nan,
             "AP50": float(np.nanmean(precisions)) if np.isfinite(precisions).any() else np.nan,
             "margin": total_score / truth - self.threshold if truth else np.nan,
         }
 
     def of_label(self, label: int) -> BoxCounts:
         """Return the counts of one class alone."""
-        rows = self.matched.label == label
+        row_indices = self.matched.label == label
         truth = np.zeros_like(self.truth)
         truth[label] = self.truth[label]
         matched = Matched2D(
-            self.matched.label[rows], self.matched.hit[rows], self.matched.ignored[rows], truth.sum(axis=1)
+            self.matched.label[row_indices],
+            self.matched.hit[row_indices],
+            self.matched.ignored[row_indices],
+            truth.sum(axis=1),
         )
-        return BoxCounts(matched, self.score[rows], self.image[rows], truth, self.threshold)
+        return BoxCounts(matched, self.score[row_indices], self.image[row_indices], truth, self.threshold)
 
 
 def count_boxes(
@@ -156,7 +164,7 @@ def photograph_scores(
         intervals.
     """
     draws = generator("photograph scores", seed).integers(images, size=(replicates, images))
-    weights = [np.bincount(draw, minlength=images) for draw in draws]
+    weights = [np.bincount(draw_weights, minlength=images) for draw_weights in draws]
     everything = HeightBand(min((band.low for band in bands), default=0.0))
 
     def counts_of(band: HeightBand) -> BoxCounts:
@@ -185,7 +193,7 @@ def photograph_scores(
 def _figures(counts: BoxCounts, weights: Sequence[I64], images: int) -> dict[str, Any]:
     """Return metrics, intervals and n of some counts."""
     values = counts.measures(np.ones(images, np.int64))
-    resampled = [counts.measures(draw) for draw in weights]
+    resampled = [counts.measures(draw_weights) for draw_weights in weights]
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float]] = {}
     for name, value in values.items():
@@ -193,7 +201,7 @@ def _figures(counts: BoxCounts, weights: Sequence[I64], images: int) -> dict[str
         # A margin is a mean score, which lies in [0, 1], less the threshold.
         offset = counts.threshold if name == "margin" else 0.0
         estimate = replicate_estimate(
-            value + offset, [draw[name] + offset for draw in resampled], n=images, clusters=images
+            value + offset, [draw_weights[name] + offset for draw_weights in resampled], n=images, clusters=images
         )
         if not np.isnan(estimate.low):
             intervals[name] = [round(estimate.low - offset, DIGITS), round(estimate.high - offset, DIGITS)]
@@ -219,18 +227,20 @@ def worn_scores(
     """
     values = _worn_measures(clean, worn, threshold)
     groups = [np.flatnonzero(image == number) for number in np.unique(image)]
-    rng = generator("worn scores", seed)
+    random_generator = generator("worn scores", seed)
     resampled: list[Mapping[str, float]] = []
     for _ in range(replicates if len(groups) > 1 else 0):
-        rows = np.concatenate([groups[index] for index in rng.integers(len(groups), size=len(groups))])
-        resampled.append(_worn_measures(clean[rows], worn[rows], threshold))
+        row_indices = np.concatenate(
+            [groups[index] for index in random_generator.integers(len(groups), size=len(groups))]
+        )
+        resampled.append(_worn_measures(clean[row_indices], worn[row_indices], threshold))
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float]] = {}
     for name, value in values.items():
         metrics[name] = None if np.isnan(value) else round(value, DIGITS)
         # A change lies in [-1, 1]: its half plus one half is a share.
         scale, offset = (0.5, 0.5) if name == "change" else (1.0, 0.0)
-        draws = [scale * draw[name] + offset for draw in resampled]
+        draws = [scale * draw_weights[name] + offset for draw_weights in resampled]
         estimate: Estimate = replicate_estimate(scale * value + offset, draws, n=len(clean), clusters=len(groups))
         if not np.isnan(estimate.low):
             limits = ((estimate.low - offset) / scale, (estimate.high - offset) / scale)

@@ -78,16 +78,18 @@ def _photograph_item(photograph: Photograph, size: tuple[int, int]) -> TrainingI
         height, width = photograph.read().shape[:2]
     scale = min(size[0] / height, size[1] / width)
     labels = [
-        FLAT_CLASSES.index(CLASSES[label]) if label >= 0 and CLASSES[label] in FLAT_CLASSES else -1
-        for label in photograph.label
+        FLAT_CLASSES.index(CLASSES[object_labels])
+        if object_labels >= 0 and CLASSES[object_labels] in FLAT_CLASSES
+        else -1
+        for object_labels in photograph.label
     ]
     is_used = (photograph.label < 0) | (np.array(labels, np.int64) >= 0)
-    box = photograph.box[is_used] * scale
-    label = np.array(labels, np.int64)[is_used]
-    is_crowd = (label < 0) | ((box[:, 2:] - box[:, :2]).min(1, initial=np.inf) < MIN_SIDE)
+    scaled_box = photograph.box[is_used] * scale
+    object_labels = np.array(labels, np.int64)[is_used]
+    is_crowd = (object_labels < 0) | ((scaled_box[:, 2:] - scaled_box[:, :2]).min(1, initial=np.inf) < MIN_SIDE)
     truth = Truth(
-        torch.from_numpy(label.clip(min=0)),
-        torch.from_numpy(box.astype(np.float32)),
+        torch.from_numpy(object_labels.clip(min=0)),
+        torch.from_numpy(scaled_box.astype(np.float32)),
         crowd=torch.from_numpy(is_crowd),
     )
     return TrainingImage(partial(_fitted_image, photograph, size), truth)

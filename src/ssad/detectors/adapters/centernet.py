@@ -66,19 +66,19 @@ def centernet_detector(file: str | Path, *, tiles: int | None = None, threshold:
 
 def _logits_of(graph: GraphFile) -> str:
     """Return the node whose sigmoid the heat maps are."""
-    node = graph.nodes.get(HEAT_MAPS)
-    while node is not None and node.op == "Identity" and node.inputs:
-        node = graph.nodes.get(node.inputs[0])
-    if node is None or node.op != "Sigmoid" or not node.inputs:
+    graph_node = graph.nodes.get(HEAT_MAPS)
+    while graph_node is not None and graph_node.op == "Identity" and graph_node.inputs:
+        graph_node = graph.nodes.get(graph_node.inputs[0])
+    if graph_node is None or graph_node.op != "Sigmoid" or not graph_node.inputs:
         raise FormatError(f"{graph.source}: no heat maps '{HEAT_MAPS}' that end in a sigmoid; use {MODEL} of {PACKAGE}")
-    return node.inputs[0]
+    return graph_node.inputs[0]
 
 
 def _features_of(graph: GraphFile, logits: str) -> str:
     """Return the map that the last convolutions before the heat maps take."""
     name = logits
-    while (node := graph.nodes.get(name)) is not None and node.op in CONVOLUTIONS and node.inputs:
-        name = node.inputs[0]
+    while (graph_node := graph.nodes.get(name)) is not None and graph_node.op in CONVOLUTIONS and graph_node.inputs:
+        name = graph_node.inputs[0]
     return name
 
 
@@ -122,29 +122,31 @@ class CenterNet(Adapter):
         tiles = torch.stack([padded[:, :, y : y + side, x : x + side] for x, y in corners], 1).flatten(0, 1)
         if side != input_side:
             tiles = functional.interpolate(tiles, (input_side, input_side), mode="bilinear", align_corners=False)
-        heat, distances, features = self.network(255 * tiles)
+        heat_maps, distances, features = self.network(255 * tiles)
         cells = input_side // STRIDE
-        if heat.shape[1:] != (len(COCO), cells, cells) or distances.shape[1:] != (4, cells, cells):
+        if heat_maps.shape[1:] != (len(COCO), cells, cells) or distances.shape[1:] != (4, cells, cells):
             raise FormatError(
-                f"{self.network.source}: heads of {list(heat.shape[1:])} and {list(distances.shape[1:])}; expected "
-                f"[{len(COCO)}, {cells}, {cells}] and [4, {cells}, {cells}]"
+                f"{self.network.source}: heads of {list(heat_maps.shape[1:])} and {list(distances.shape[1:])}; "
+                f"expected [{len(COCO)}, {cells}, {cells}] and [4, {cells}, {cells}]"
             )
         scale = side / input_side
-        offset = torch.tensor(corners, device=heat.device, dtype=heat.dtype)[:, None]
-        index = torch.arange(cells, device=heat.device, dtype=heat.dtype) * STRIDE
-        cell = torch.stack((index.expand(cells, cells), index[:, None].expand(cells, cells)), -1).reshape(-1, 2)
+        offset = torch.tensor(corners, device=heat_maps.device, dtype=heat_maps.dtype)[:, None]
+        cell_offset = torch.arange(cells, device=heat_maps.device, dtype=heat_maps.dtype) * STRIDE
+        cell = torch.stack((cell_offset.expand(cells, cells), cell_offset[:, None].expand(cells, cells)), -1).reshape(
+            -1, 2
+        )
         place = (offset + (cell + STRIDE / 2) * scale).reshape(-1, 2)
         corner = (offset + cell * scale).reshape(-1, 2)
         reach = self._by_place(distances * scale, len(images))
-        box = torch.cat((corner - reach[..., :2], corner + reach[..., 2:]), -1)
+        object_box = torch.cat((corner - reach[..., :2], corner + reach[..., 2:]), -1)
         return Dense(
-            logit=self._by_place(heat, len(images)),
+            logit=self._by_place(heat_maps, len(images)),
             quality=None,
-            box=box,
+            box=object_box,
             place=place,
-            stride=torch.full((len(place),), STRIDE * scale, device=heat.device),
-            level=torch.zeros(len(place), dtype=torch.int64, device=heat.device),
-            maps={"heat": [heat], "distances": [distances]},
+            stride=torch.full((len(place),), STRIDE * scale, device=heat_maps.device),
+            level=torch.zeros(len(place), dtype=torch.int64, device=heat_maps.device),
+            maps={"heat": [heat_maps], "distances": [distances]},
             features=(torch.cat(list(features.unflatten(0, (len(images), -1)).unbind(1)), 3),),
             size=size,
         )
@@ -155,14 +157,14 @@ class CenterNet(Adapter):
 
     def choose(self, dense: Dense, min_score: float) -> list[Detections]:
         """Return the peaks of the heat maps, boxes of one object in several tiles suppressed within a class."""
-        (heat,) = dense.maps["heat"]
-        is_peak = heat == functional.max_pool2d(heat, 3, 1, 1)
-        score = self._by_place(torch.where(is_peak, heat.sigmoid(), 0.0), len(dense.logit))
+        (heat_maps,) = dense.maps["heat"]
+        is_peak = heat_maps == functional.max_pool2d(heat_maps, 3, 1, 1)
+        score = self._by_place(torch.where(is_peak, heat_maps.sigmoid(), 0.0), len(dense.logit))
         # A box that learned no order of its sides would be no box.
-        box = torch.cat(
+        object_box = torch.cat(
             (dense.box[..., :2].minimum(dense.box[..., 2:]), dense.box[..., :2].maximum(dense.box[..., 2:])), -1
         )
-        return select(score, box, threshold=min_score, iou=NMS_IOU, limit=MAX_DETECTIONS, size=dense.size)
+        return select(score, object_box, threshold=min_score, iou=NMS_IOU, limit=MAX_DETECTIONS, size=dense.size)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -183,28 +185,31 @@ class CenterNet(Adapter):
         label = torch.full((images, places), -1, device=unit.device)
         owner = torch.full_like(label, -1)
         target_box = torch.zeros_like(dense.box)
-        heat = torch.zeros_like(dense.logit)
+        heat_maps = torch.zeros_like(dense.logit)
         half = dense.stride / 2
         for image in range(images):
             rows = targets.real[image].nonzero()[:, 0]
-            box = targets.box[image, rows]
+            object_box = targets.box[image, rows]
             is_crowd = targets.crowd[image, rows]
-            largest_first = (box[:, 2:] - box[:, :2]).prod(1).argsort(descending=True, stable=True)
+            largest_first = (object_box[:, 2:] - object_box[:, :2]).prod(1).argsort(descending=True, stable=True)
             for row in largest_first.tolist():
-                x1, y1, x2, y2 = box[row]
+                x1, y1, x2, y2 = object_box[row]
                 if bool(is_crowd[row]):
-                    is_inside = ((dense.place >= box[row, :2]) & (dense.place <= box[row, 2:])).all(1)
+                    is_inside = ((dense.place >= object_box[row, :2]) & (dense.place <= object_box[row, 2:])).all(1)
                     label[image] = torch.where(is_inside & (label[image] == -1), -2, label[image])
                     continue
-                centre, sides = (box[row, :2] + box[row, 2:]) / 2, box[row, 2:] - box[row, :2]
+                centre, sides = (
+                    (object_box[row, :2] + object_box[row, 2:]) / 2,
+                    object_box[row, 2:] - object_box[row, :2],
+                )
                 away = dense.place - centre
                 class_index = int(targets.label[image, rows[row]])
                 bell = (-0.5 * (away / (GAUSSIAN_SHARE * sides).maximum(half[:, None])).square().sum(1)).exp()
-                heat[image, :, class_index] = heat[image, :, class_index].maximum(bell)
+                heat_maps[image, :, class_index] = heat_maps[image, :, class_index].maximum(bell)
                 is_centre = ((away > -half[:, None]) & (away <= half[:, None])).all(1)
                 label[image, is_centre], owner[image, is_centre] = class_index, rows[row]
                 target_box[image, is_centre] = torch.stack((x1, y1, x2, y2))
-        return Assignment(label, owner, tuple(truth), {"box": target_box, "heat": heat})
+        return Assignment(label, owner, tuple(truth), {"box": target_box, "heat": heat_maps})
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
@@ -236,10 +241,10 @@ class CenterNet(Adapter):
         target = assignment.extra["box"].to(dense.box)[image, place]
         box_loss = BOX_WEIGHT * generalized_box_iou_loss(dense.box[image, place], target)
         parts = {"heat": heat_loss, "box": sum_by_image(box_loss, image, images)}
-        count = sum_by_image(torch.ones_like(box_loss), image, images)
+        centre_count = sum_by_image(torch.ones_like(box_loss), image, images)
         if reduction == "image":
-            return {name: part / count.clamp(min=1) for name, part in parts.items()}
-        return {name: part.sum() / count.sum().clamp(min=1) for name, part in parts.items()}
+            return {name: loss_sum / centre_count.clamp(min=1) for name, loss_sum in parts.items()}
+        return {name: loss_sum.sum() / centre_count.sum().clamp(min=1) for name, loss_sum in parts.items()}
 
 
 def tile_corners(size: tuple[int, int], tiles: int | None) -> tuple[list[tuple[int, int]], int]:
@@ -251,8 +256,8 @@ def tile_corners(size: tuple[int, int], tiles: int | None) -> tuple[list[tuple[i
             sides.
     """
     short, long = min(size), max(size)
-    count = tiles or (1 if short == long else math.ceil(TILES_PER_RATIO * long / short))
-    if count == 1:
+    centre_count = tiles or (1 if short == long else math.ceil(TILES_PER_RATIO * long / short))
+    if centre_count == 1:
         return [(0, 0)], long
-    starts = [round(index * (long - short) / (count - 1)) for index in range(count)]
+    starts = [round(cell_offset * (long - short) / (centre_count - 1)) for cell_offset in range(centre_count)]
     return [(start, 0) if size[1] >= size[0] else (0, start) for start in starts], short

@@ -81,10 +81,13 @@ def read_graph_file(path: Path, model: str) -> GraphFile:
     content = parse_json(topology, source)
     try:
         nodes = {
-            str(node["name"]): Node(
-                str(node["name"]), str(node["op"]), tuple(map(str, node.get("input", ()))), node.get("attr", {})
+            str(graph_node["name"]): Node(
+                str(graph_node["name"]),
+                str(graph_node["op"]),
+                tuple(map(str, graph_node.get("input", ()))),
+                graph_node.get("attr", {}),
             )
-            for node in content["modelTopology"]["node"]
+            for graph_node in content["modelTopology"]["node"]
         }
         weights: dict[str, np.ndarray[Any, Any]] = {}
         for group in content["weightsManifest"]:
@@ -151,24 +154,24 @@ def _read_archive(path: Path, model: str) -> dict[str, bytes]:
 def _parse_weights(entries: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, np.ndarray[Any, Any]]:
     """Return the tensors of a group of the manifest."""
     weights: dict[str, np.ndarray[Any, Any]] = {}
-    start = 0
+    start_byte = 0
     for entry in entries:
         name = str(entry["name"])
-        shape = tuple(int(length) for length in entry["shape"])
+        tensor_shape = tuple(int(length) for length in entry["shape"])
         stored_type = str((entry.get("quantization") or {}).get("dtype", entry["dtype"]))
-        if stored_type not in NUMBER_TYPES or min(shape, default=1) < 0:
-            raise FormatError(f"weight {name}: {stored_type} of shape {list(shape)} is not read")
+        if stored_type not in NUMBER_TYPES or min(tensor_shape, default=1) < 0:
+            raise FormatError(f"weight {name}: {stored_type} of shape {list(tensor_shape)} is not read")
         dtype = np.dtype(NUMBER_TYPES[stored_type]).newbyteorder("<")
-        end = start + math.prod(shape) * dtype.itemsize
+        end = start_byte + math.prod(tensor_shape) * dtype.itemsize
         if end > len(data):
             raise FormatError(f"weight {name}: the file of weights is too short ({len(data)} bytes)")
-        values = np.frombuffer(data[start:end], dtype).reshape(shape)
+        values = np.frombuffer(data[start_byte:end], dtype).reshape(tensor_shape)
         weights[name] = values.astype(np.int32 if stored_type == "int32" else np.float32)
         if not np.isfinite(weights[name]).all():
             raise FormatError(f"weight {name}: a value is not finite")
-        start = end
-    if start != len(data):
-        raise FormatError(f"the file of weights has {len(data)} bytes, the manifest {start}")
+        start_byte = end
+    if start_byte != len(data):
+        raise FormatError(f"the file of weights has {len(data)} bytes, the manifest {start_byte}")
     return weights
 
 
@@ -190,40 +193,45 @@ class GraphModel(nn.Module):
         self.source = graph.source
         self.outputs = tuple(outputs)
         self.order = _sort_nodes(graph, outputs)
-        placeholders = [node for node in self.order if node.op == "Placeholder"]
+        placeholders = [graph_node for graph_node in self.order if graph_node.op == "Placeholder"]
         if len(placeholders) != 1:
             raise FormatError(f"{graph.source}: {len(placeholders)} inputs, expected one")
         self.input = placeholders[0].name
         self.input_size = _input_size(graph.source, placeholders[0])
         self.constants = {
-            node.name: graph.weights[node.name] for node in self.order if node.op == "Const" and graph.weights
+            graph_node.name: graph.weights[graph_node.name]
+            for graph_node in self.order
+            if graph_node.op == "Const" and graph.weights
         }
         self.weights = nn.ParameterDict()
-        for node in self.order:
-            if node.op not in OPERATIONS:
-                raise FormatError(f"{graph.source}: node {node.name}: the operation {node.op} is not supported")
-            if node.op in CONVOLUTIONS:
-                self._add_convolution(node)
+        for graph_node in self.order:
+            if graph_node.op not in OPERATIONS:
+                raise FormatError(
+                    f"{graph.source}: node {graph_node.name}: the operation {graph_node.op} is not supported"
+                )
+            if graph_node.op in CONVOLUTIONS:
+                self._add_convolution(graph_node)
         self.requires_grad_(False).eval()
 
-    def _add_convolution(self, node: Node) -> None:
+    def _add_convolution(self, graph_node: Node) -> None:
         """Store the kernel of a convolution as PyTorch has it, and its bias."""
-        values = [self.constants.get(name) for name in node.inputs[1:]]
+        values = [self.constants.get(name) for name in graph_node.inputs[1:]]
         kernel = values[0] if values else None
         if kernel is None or kernel.ndim != 4 or any(value is None for value in values):
-            raise FormatError(f"{self.source}: node {node.name}: its kernel or bias is no constant")
-        if "Depthwise" in node.op:  # [h, w, in, multiplier] to [in * multiplier, 1, h, w]
+            raise FormatError(f"{self.source}: node {graph_node.name}: its kernel or bias is no constant")
+        if "Depthwise" in graph_node.op:  # [h, w, in, multiplier] to [in * multiplier, 1, h, w]
             kernel = kernel.transpose(2, 3, 0, 1).reshape(-1, 1, *kernel.shape[:2])
         else:  # [h, w, in, out] to [out, in, h, w]
             kernel = kernel.transpose(3, 2, 0, 1)
-        self.weights[_key(node.name)] = nn.Parameter(torch.from_numpy(np.ascontiguousarray(kernel)))
+        self.weights[_key(graph_node.name)] = nn.Parameter(torch.from_numpy(np.ascontiguousarray(kernel)))
         if len(values) > 1:
-            bias = np.ascontiguousarray(values[1])
-            if bias.shape != kernel.shape[:1]:
+            bias_values = np.ascontiguousarray(values[1])
+            if bias_values.shape != kernel.shape[:1]:
                 raise FormatError(
-                    f"{self.source}: node {node.name}: bias {list(bias.shape)} of a kernel for {kernel.shape[0]} maps"
+                    f"{self.source}: node {graph_node.name}: bias {list(bias_values.shape)} of a kernel for "
+                    f"{kernel.shape[0]} maps"
                 )
-            self.weights[_key(node.name, "bias")] = nn.Parameter(torch.from_numpy(bias))
+            self.weights[_key(graph_node.name, "bias")] = nn.Parameter(torch.from_numpy(bias_values))
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         """Return the outputs for images [B, C, H, W] of `input_size`.
@@ -232,17 +240,17 @@ class GraphModel(nn.Module):
             FormatError: The shapes of the graph do not fit together.
         """
         values: dict[str, Tensor] = {self.input: images}
-        for node in self.order:
-            if node.op in ("Placeholder", "Const"):
+        for graph_node in self.order:
+            if graph_node.op in ("Placeholder", "Const"):
                 continue
             try:
-                values[node.name] = OPERATIONS[node.op](self, node, values)
+                values[graph_node.name] = OPERATIONS[graph_node.op](self, graph_node, values)
             except (RuntimeError, KeyError, IndexError, TypeError) as error:
                 reason = " ".join(str(error).split())[:120]
-                raise FormatError(f"{self.source}: node {node.name} ({node.op}): {reason}") from None
+                raise FormatError(f"{self.source}: node {graph_node.name} ({graph_node.op}): {reason}") from None
         return tuple(values[name] for name in self.outputs)
 
-    def operand(self, name: str, values: Mapping[str, Tensor], like: Tensor | None = None) -> Tensor:
+    def operand(self, name: str, values: Mapping[str, Tensor], template: Tensor | None = None) -> Tensor:
         """Return a value of the graph, or a constant that broadcasts over maps."""
         if name in values:
             return values[name]
@@ -253,7 +261,7 @@ class GraphModel(nn.Module):
             constant = constant.permute(0, 3, 1, 2)
         elif constant.ndim:
             raise KeyError(f"constant {name} of {constant.ndim} dimensions")
-        return constant if like is None else constant.to(like)
+        return constant if template is None else constant.to(template)
 
 
 def _key(name: str, kind: str = "kernel") -> str:
@@ -270,43 +278,43 @@ def _sort_nodes(graph: GraphFile, outputs: Sequence[str]) -> list[Node]:
         name, are_inputs_done = pending.pop()
         if name in ordered:
             continue
-        node = graph.nodes.get(name)
-        if node is None:
+        graph_node = graph.nodes.get(name)
+        if graph_node is None:
             raise FormatError(f"{graph.source}: no node '{name}'")
         if are_inputs_done:
-            ordered[name] = node
+            ordered[name] = graph_node
             continue
         if name in open_names:
             raise FormatError(f"{graph.source}: node '{name}' depends on itself")
         open_names.add(name)
-        if node.op == "Const" and name not in graph.weights:
+        if graph_node.op == "Const" and name not in graph.weights:
             raise FormatError(f"{graph.source}: constant '{name}' has no value in the manifest")
         pending.append((name, True))
-        pending.extend((input_name, False) for input_name in reversed(node.inputs))
+        pending.extend((input_name, False) for input_name in reversed(graph_node.inputs))
     return list(ordered.values())
 
 
-def _input_size(source: str, node: Node) -> tuple[int, int]:
+def _input_size(source: str, graph_node: Node) -> tuple[int, int]:
     """Return height and width of the input [1, H, W, 3]."""
     try:
-        shape = [int(length["size"]) for length in node.attributes["shape"]["shape"]["dim"]]
+        tensor_shape = [int(length["size"]) for length in graph_node.attributes["shape"]["shape"]["dim"]]
     except (KeyError, TypeError, ValueError):
-        shape = []
-    if len(shape) != 4 or shape[3] != 3 or not 0 < min(shape[1:]) <= max(shape[1:]) <= 4096:
-        raise FormatError(f"{source}: input '{node.name}' of shape {shape}; expected [1, H, W, 3]")
-    return shape[1], shape[2]
+        tensor_shape = []
+    if len(tensor_shape) != 4 or tensor_shape[3] != 3 or not 0 < min(tensor_shape[1:]) <= max(tensor_shape[1:]) <= 4096:
+        raise FormatError(f"{source}: input '{graph_node.name}' of shape {tensor_shape}; expected [1, H, W, 3]")
+    return tensor_shape[1], tensor_shape[2]
 
 
 # ---------------------------------------------------------------- operations
 
 
-def _text(node: Node, name: str) -> str:
+def _text(graph_node: Node, name: str) -> str:
     """Return an attribute that is a text, which the file holds in base64."""
-    return base64.b64decode(node.attributes[name]["s"]).decode()
+    return base64.b64decode(graph_node.attributes[name]["s"]).decode()
 
 
-def _integers(node: Node, name: str) -> list[int]:
-    return [int(value) for value in node.attributes[name]["list"]["i"]]
+def _integers(graph_node: Node, name: str) -> list[int]:
+    return [int(value) for value in graph_node.attributes[name]["list"]["i"]]
 
 
 def pad_same(images: Tensor, kernel: Sequence[int], stride: Sequence[int], *, value: float = 0.0) -> Tensor:
@@ -325,21 +333,21 @@ def pad_same(images: Tensor, kernel: Sequence[int], stride: Sequence[int], *, va
     return functional.pad(images, padding, value=value) if any(padding) else images
 
 
-def _convolve(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Tensor:
-    images = model.operand(node.inputs[0], values)
-    kernel = model.weights[_key(node.name)].to(images.dtype)
-    bias_key = _key(node.name, "bias")
-    bias = model.weights[bias_key].to(images.dtype) if bias_key in model.weights else None
-    _, *stride, _ = _integers(node, "strides")
-    _, *dilation, _ = _integers(node, "dilations") if "dilations" in node.attributes else [1, 1, 1, 1]
-    if _text(node, "padding") == "SAME":
+def _convolve(model: GraphModel, graph_node: Node, values: Mapping[str, Tensor]) -> Tensor:
+    images = model.operand(graph_node.inputs[0], values)
+    kernel = model.weights[_key(graph_node.name)].to(images.dtype)
+    bias_key = _key(graph_node.name, "bias")
+    bias_values = model.weights[bias_key].to(images.dtype) if bias_key in model.weights else None
+    _, *stride, _ = _integers(graph_node, "strides")
+    _, *dilation, _ = _integers(graph_node, "dilations") if "dilations" in graph_node.attributes else [1, 1, 1, 1]
+    if _text(graph_node, "padding") == "SAME":
         reach = [(length - 1) * step + 1 for length, step in zip(kernel.shape[2:], dilation, strict=True)]
         images = pad_same(images, reach, stride)
-    elif _text(node, "padding") != "VALID":
-        raise KeyError(f"padding {_text(node, 'padding')} is not supported")
-    groups = images.shape[1] if "Depthwise" in node.op else 1
-    convolved = functional.conv2d(images, kernel, bias, tuple(stride), 0, tuple(dilation), groups)
-    fused = node.attributes.get("fused_ops", {}).get("list", {}).get("s", [])
+    elif _text(graph_node, "padding") != "VALID":
+        raise KeyError(f"padding {_text(graph_node, 'padding')} is not supported")
+    groups = images.shape[1] if "Depthwise" in graph_node.op else 1
+    convolved = functional.conv2d(images, kernel, bias_values, tuple(stride), 0, tuple(dilation), groups)
+    fused = graph_node.attributes.get("fused_ops", {}).get("list", {}).get("s", [])
     for name in (base64.b64decode(text).decode() for text in fused):
         if name == "Relu":
             convolved = convolved.relu()
@@ -350,54 +358,57 @@ def _convolve(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Te
     return convolved
 
 
-def _combine(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Tensor:
-    like = next(values[name] for name in node.inputs if name in values)
-    first, second = (model.operand(name, values, like) for name in node.inputs)
-    if node.op == "Mul":
+def _combine(model: GraphModel, graph_node: Node, values: Mapping[str, Tensor]) -> Tensor:
+    template = next(values[name] for name in graph_node.inputs if name in values)
+    first, second = (model.operand(name, values, template) for name in graph_node.inputs)
+    if graph_node.op == "Mul":
         return first * second
-    return first - second if node.op == "Sub" else first + second
+    return first - second if graph_node.op == "Sub" else first + second
 
 
-def _mean(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Tensor:
-    axes = [CHANNEL_AXES[int(axis)] for axis in np.atleast_1d(model.constants[node.inputs[1]])]
-    if not node.attributes.get("keep_dims", {}).get("b", False):
+def _mean(model: GraphModel, graph_node: Node, values: Mapping[str, Tensor]) -> Tensor:
+    axes = [CHANNEL_AXES[int(axis)] for axis in np.atleast_1d(model.constants[graph_node.inputs[1]])]
+    if not graph_node.attributes.get("keep_dims", {}).get("b", False):
         raise KeyError("a mean that drops axes is not supported")
-    return values[node.inputs[0]].mean(axes, keepdim=True)
+    return values[graph_node.inputs[0]].mean(axes, keepdim=True)
 
 
-def _concatenate(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Tensor:
-    *names, axis = node.inputs
+def _concatenate(model: GraphModel, graph_node: Node, values: Mapping[str, Tensor]) -> Tensor:
+    *names, axis = graph_node.inputs
     return torch.cat([values[name] for name in names], CHANNEL_AXES[int(model.constants[axis])])
 
 
-def _resize(model: GraphModel, node: Node, values: Mapping[str, Tensor]) -> Tensor:
-    flags = {name: node.attributes.get(name, {}).get("b", False) for name in ("align_corners", "half_pixel_centers")}
+def _resize(model: GraphModel, graph_node: Node, values: Mapping[str, Tensor]) -> Tensor:
+    flags = {
+        name: graph_node.attributes.get(name, {}).get("b", False) for name in ("align_corners", "half_pixel_centers")
+    }
     if any(flags.values()):
         raise KeyError("only legacy bilinear resizing is supported")
-    images = values[node.inputs[0]]
-    height, width = (int(length) for length in model.constants[node.inputs[1]])
+    images = values[graph_node.inputs[0]]
+    height, width = (int(length) for length in model.constants[graph_node.inputs[1]])
     rows, columns = (
-        _interpolation(old, new).to(images) for old, new in zip(images.shape[2:], (height, width), strict=True)
+        _interpolation(old_length, new_length).to(images)
+        for old_length, new_length in zip(images.shape[2:], (height, width), strict=True)
     )
     return rows @ images @ columns.T
 
 
-def _interpolation(old: int, new: int) -> Tensor:
+def _interpolation(old_length: int, new_length: int) -> Tensor:
     """Return the matrix [new, old] of TensorFlow's legacy resizing, whose pixel i lies at i * old / new."""
-    position = torch.arange(new, dtype=torch.float64) * old / new
-    low = position.floor().long().clamp(max=old - 1)
-    high = (low + 1).clamp(max=old - 1)
+    position = torch.arange(new_length, dtype=torch.float64) * old_length / new_length
+    low = position.floor().long().clamp(max=old_length - 1)
+    high = (low + 1).clamp(max=old_length - 1)
     share = (position - low)[:, None]
-    return functional.one_hot(low, old) * (1 - share) + functional.one_hot(high, old) * share
+    return functional.one_hot(low, old_length) * (1 - share) + functional.one_hot(high, old_length) * share
 
 
 OPERATIONS: Final[Mapping[str, Callable[[GraphModel, Node, Mapping[str, Tensor]], Tensor]]] = {
-    "Placeholder": lambda model, node, values: values[node.name],
-    "Const": lambda model, node, values: values[node.name],
-    "Identity": lambda model, node, values: values[node.inputs[0]],
-    "Relu": lambda model, node, values: values[node.inputs[0]].relu(),
-    "Relu6": lambda model, node, values: values[node.inputs[0]].clamp(0, 6),
-    "Sigmoid": lambda model, node, values: values[node.inputs[0]].sigmoid(),
+    "Placeholder": lambda model, graph_node, values: values[graph_node.name],
+    "Const": lambda model, graph_node, values: values[graph_node.name],
+    "Identity": lambda model, graph_node, values: values[graph_node.inputs[0]],
+    "Relu": lambda model, graph_node, values: values[graph_node.inputs[0]].relu(),
+    "Relu6": lambda model, graph_node, values: values[graph_node.inputs[0]].clamp(0, 6),
+    "Sigmoid": lambda model, graph_node, values: values[graph_node.inputs[0]].sigmoid(),
     "Add": _combine,
     "AddV2": _combine,
     "Sub": _combine,

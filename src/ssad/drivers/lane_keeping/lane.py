@@ -14,7 +14,7 @@ import numpy as np
 
 from ssad.core.perception import PerceivedLane
 from ssad.core.types import F32, F64
-from ssad.drivers.lane_keeping.markings import TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid
 
 # reach, m, and half width, m, around the predicted line, of the fits one after the other: each extends the one before
 FITS: Final = ((14.0, 0.7), (20.0, 0.6), (28.0, 0.5), (np.inf, 0.4))
@@ -43,7 +43,7 @@ class LaneFilter:
         grid: Top view that markings are given in.
     """
 
-    def __init__(self, grid: TopView) -> None:
+    def __init__(self, grid: RoadGrid) -> None:
         self.grid = grid
         self.state: F64 | None = None
         self.covariance: F64 = np.diag(np.square(INITIAL))
@@ -118,7 +118,7 @@ class LaneFilter:
         return PerceivedLane(*self.state.tolist(), confidence)
 
 
-def line_places(strength: F32, grid: TopView, line: F64, window: float) -> tuple[F64, F64]:
+def line_places(strength: F32, grid: RoadGrid, line: F64, window: float) -> tuple[F64, F64]:
     """Return the mean place of the markings near a line in each row, and their weight.
 
     Args:
@@ -138,7 +138,7 @@ def line_places(strength: F32, grid: TopView, line: F64, window: float) -> tuple
     return place, (total * grid.column_step / 0.1).clip(0.0, 1.0)
 
 
-def search_lane(strength: F32, grid: TopView) -> F64 | None:
+def search_lane(strength: F32, grid: RoadGrid) -> F64 | None:
     """Return the lane [4] of offset, heading, curvature and width with the clearest lines; None: there is none.
 
     Both lines must be there, and a lane near the middle of the ego counts more than a neighbouring one.

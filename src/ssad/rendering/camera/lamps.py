@@ -38,7 +38,7 @@ TAIL_LAMPS = (0.25, (1.6, 1.0), (1.0, 0.05, 0.03), 8.0, 0.0)
 BRAKE_RATIO = 100.0 / 8.0  # of the light of stop lamps to that of position lamps: 100 and 8 cd
 BEAM_CANDELA = 12000.0  # largest intensity of a low beam
 BEAM_HEIGHT = 0.65  # m
-BEAM_REACH, OWN_BEAM_REACH = 70.0, 120.0  # m, of other vehicles and of the one that carries the camera
+BEAM_REACH, OWN_BEAM_REACH = 60.0, 120.0  # m, of other vehicles and of the one that carries the camera
 BEAM_COLOUR = (1.0, 0.97, 0.90)
 STREET_LAMP = (26.0, (2.4, 1.7), (1.0, 0.86, 0.66), 28.0)
 LIT_UP_TO = 130.0  # m from the eye up to which lamps of bodies and of the street are on
@@ -126,16 +126,17 @@ def beam_shape(across: F64, down: F64) -> F64:
         across: Tangents of the directions to the right.
         down: Tangents downwards, of the same shape.
     """
-    right, up = np.degrees(np.arctan(across)), -np.degrees(np.arctan(down))
-    above = up + 0.57 - np.minimum(0.268 * np.maximum(right, 0.0), 1.1)
+    edge_squared = BEAM_SPREAD[0] ** 2
+    right, squared_radius = np.degrees(across), across**2 + down**2
+    above = 0.57 - np.degrees(down) - np.minimum(0.268 * np.maximum(right, 0.0), 1.1)
+    fade = np.clip(5.0 * (edge_squared - squared_radius), 0.0, 1.0)
     edge = np.clip(0.5 - 2.5 * above, 0.0, 1.0)
     edge = edge * edge * (3.0 - 2.0 * edge)
-    fade = np.clip((BEAM_SPREAD[0] - np.hypot(across, down)) / 0.15, 0.0, 1.0)
-    wide = fade * np.exp(-0.5 * right**2 / 484.0)
-    below = np.minimum(above, 0.0)
-    hot = np.exp(-0.5 * right**2 / 49.0) * np.exp(below / 3.0)
-    glare = 0.018 * wide * np.exp(-0.25 * np.maximum(above, 0.0))
-    return np.asarray(glare + edge * (hot + 0.12 * wide * np.exp(below / 8.0)), np.float64)
+    below = np.maximum(-above, 0.0)
+    hot = 1.0 / ((1.0 + right**2 / 98.0) ** 2 * (1.0 + below / 3.0 + below**2 / 12.0))
+    wide = fade / ((1.0 + right**2 / 968.0) * (1.0 + below / 8.0 + below**2 / 100.0))
+    light = 0.018 * fade + edge * (hot + 0.12 * wide)
+    return np.asarray(np.where(squared_radius < edge_squared, light, 0.0), np.float64)
 
 
 def own_lamps(vehicle: F64, weather: SceneWeather) -> tuple[SceneLamp, ...]:

@@ -73,7 +73,7 @@ class RealitySuite(SuiteBase):
     photographs: int = Field(default=500, ge=1)
     score: float = Field(default=0.25, gt=0.0, lt=1.0)
     heights: Annotated[list[float], Field(min_length=1)] = Field(default=[16.0, 24.0, 48.0, 96.0])
-    textures: Names = Field(default=[])
+    textures: list[str] = Field(default=[])
     controls: list[Literal["random", "noise", "grey", "shuffled"]] = Field(default=["random", "shuffled"])
     draws: int = Field(default=3, ge=1, le=100)
     wearer_height: float = Field(default=40.0, ge=8.0)

@@ -30,8 +30,12 @@ def section(run: Run, verdict: Sequence[str]) -> tuple[str, Sequence[Table]]:
     textures = texture_table(run)
     tables += [textures] if textures.rows else []
     failures = [
-        ([field(name)(line) for name in ("detector", "texture", "pasted")], line["status"], line.get("reason", ""))
-        for line in run.failures
+        (
+            [field(name)(record) for name in ("detector", "texture", "pasted")],
+            record["status"],
+            record.get("reason", ""),
+        )
+        for record in run.failures
     ]
     page = render(
         TEMPLATE,
@@ -40,14 +44,14 @@ def section(run: Run, verdict: Sequence[str]) -> tuple[str, Sequence[Table]]:
         tables=tables,
         failures=[[*heads, f"{status}: {reason}" if reason else status] for heads, status, reason in failures],
         pictures=pictures(run.folder),
-        data=run.header.get("inputs", {}).get("data", {}),
+        data=run.header.get("data", {}),
     )
     return page, tables
 
 
 def clean_lines(run: Run) -> list[Line]:
     """Return the records of clean photographs."""
-    return [line for line in run.lines if line["pasted"] == CLEAN]
+    return [record for record in run.lines if record["pasted"] == CLEAN]
 
 
 def main_table(run: Run) -> Table:
@@ -59,7 +63,7 @@ def main_table(run: Run) -> Table:
         clean_lines(run),
         rows={"Detector": field("detector")},
         columns={"n": "objects", **PERCENT, **COUNTS},
-        metric=lambda line, name: number_of(line, name, line.get("n", 0)),
+        metric=lambda record, name: number_of(record, name, record.get("n", 0)),
         note=(
             f"Recall, precision and numbers of boxes at a score of {score:g}, AP50 over all scores, mean over the "
             f"classes that occur. Score margin: mean score with which an object is found (0: not at all), less "
@@ -68,47 +72,50 @@ def main_table(run: Run) -> Table:
     )
 
 
-def part_table(run: Run, kind: str) -> Table:
+def part_table(run: Run, part_kind: str) -> Table:
     """Return the scores by class or by height of the object."""
     return Table.listing(
-        f"photographs-{kind}",
-        f"By {'height of the object' if kind == 'height' else kind}",
-        list(_parts(run, kind)),
-        rows={"Detector": lambda part: part["detector"], kind.capitalize(): lambda part: part["name"]},
+        f"photographs-{part_kind}",
+        f"By {'height of the object' if part_kind == 'height' else part_kind}",
+        list(_parts(run, part_kind)),
+        rows={
+            "Detector": lambda part_record: part_record["detector"],
+            part_kind.capitalize(): lambda part_record: part_record["name"],
+        },
         columns={"n": "objects", **PERCENT},
-        metric=lambda part, name: number_of(part, name, part["n"]),
+        metric=lambda part_record, name: number_of(part_record, name, part_record["n"]),
         note="Of a height: boxes of another height that find nothing are left out, as COCO does with areas."
-        if kind == "height"
+        if part_kind == "height"
         else "A detector is scored on the classes that it knows.",
     )
 
 
-def _parts(run: Run, kind: str) -> Iterator[Mapping[str, Any]]:
-    for line in clean_lines(run):
-        for part in line.get("parts") or []:
-            if part["by"] == kind:
-                yield {"detector": line["detector"], "status": "ok", **part}
+def _parts(run: Run, part_kind: str) -> Iterator[Mapping[str, Any]]:
+    for record in clean_lines(run):
+        for part_record in record.get("parts") or []:
+            if part_record["by"] == part_kind:
+                yield {"detector": record["detector"], "status": "ok", **part_record}
 
 
 def texture_table(run: Run) -> Table:
     """Return the cars that wear a texture, beside those that wear its controls and the same cars clean."""
-    worn = [line for line in run.lines if line["pasted"] != CLEAN]
-    by_detector = {line["detector"]: line for line in clean_lines(run)}
-    lines = []
-    for detector in dict.fromkeys(line["detector"] for line in worn):
-        lines += [by_detector[detector]] if detector in by_detector else []
-        lines += [line for line in worn if line["detector"] == detector]
+    worn = [record for record in run.lines if record["pasted"] != CLEAN]
+    by_detector = {record["detector"]: record for record in clean_lines(run)}
+    records = []
+    for detector in dict.fromkeys(record["detector"] for record in worn):
+        records += [by_detector[detector]] if detector in by_detector else []
+        records += [record for record in worn if record["detector"] == detector]
     return Table.listing(
         "textures",
         "Textures on cars in photographs",
-        lines,
+        records,
         rows={
             "Detector": field("detector"),
-            "Texture": lambda line: line["texture"] or "none",
+            "Texture": lambda record: record["texture"] or "none",
             "Pasted": field("pasted"),
         },
         columns={"n": "cars", **WORN},
-        metric=lambda line, name: number_of(line, name, line.get("cars", line.get("n", 0))),
+        metric=lambda record, name: number_of(record, name, record.get("cars", record.get("n", 0))),
         note=(
             f"Found: share of the cars that a box of at least {run.suite['score']:g} finds; hidden: of those found "
             "clean, the share that is not found. A control is not trained: where it hides as much, the texture proves "
@@ -117,14 +124,14 @@ def texture_table(run: Run) -> Table:
     )
 
 
-def number_of(line: Mapping[str, Any], name: str, n: int) -> TableCell:
+def number_of(record: Mapping[str, Any], name: str, object_count: int) -> TableCell:
     """Return a metric of a record or of one of its parts, with its interval; shares in percent."""
     if name == "n":
-        return TableCell.value(float(n) if line["status"] == "ok" else None, digits=0)
-    value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None
+        return TableCell.value(float(object_count) if record["status"] == "ok" else None, digits=0)
+    value = (record.get("metrics") or {}).get(name) if record["status"] == "ok" else None
     if value is None:
         return TableCell(math.nan)
     scale = 100.0 if name in PERCENT or name in ("found", "hidden") else 1.0
-    low, high = (line.get("intervals") or {}).get(name) or (math.nan, math.nan)
+    low, high = (record.get("intervals") or {}).get(name) or (math.nan, math.nan)
     digits = 1 if scale == 100.0 or name in COUNTS else 2
-    return TableCell(scale * value, scale * low, scale * high, n, digits=digits, method="given")
+    return TableCell(scale * value, scale * low, scale * high, object_count, digits=digits, method="given")

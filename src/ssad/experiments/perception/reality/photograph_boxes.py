@@ -44,8 +44,8 @@ class PhotographBoxes:
 
     def of(self, image: int, label: int) -> tuple[F64, F64]:
         """Return boxes [M, 4] and scores [M] of one class in one photograph."""
-        rows = (self.image == image) & (self.label == label)
-        return self.box[rows], self.score[rows]
+        chosen_rows = (self.image == image) & (self.label == label)
+        return self.box[chosen_rows], self.score[chosen_rows]
 
     def as_table(self) -> Boxes2D:
         """Return the boxes as the metrics take them."""
@@ -71,18 +71,18 @@ def true_boxes(photographs: Sequence[Photograph], labels: Sequence[int]) -> Boxe
         photographs: The photographs.
         labels: Indices into `ROAD_CLASSES`.
     """
-    rows: list[tuple[int, int, F64, bool]] = []
+    chosen_rows: list[tuple[int, int, F64, bool]] = []
     for number, photograph in enumerate(photographs):
         for box, fine_label in zip(photograph.box, photograph.label.tolist(), strict=True):
             if fine_label < 0:
-                rows += [(number, label, box, True) for label in labels]
+                chosen_rows += [(number, label, box, True) for label in labels]
             elif (label := road_label(CLASSES[fine_label])) in labels:
-                rows.append((number, label, box, False))
+                chosen_rows.append((number, label, box, False))
     return Boxes2D(
-        np.array([row[0] for row in rows], np.int32),
-        np.array([row[1] for row in rows], np.int32),
-        np.array([row[2] for row in rows], np.float64).reshape(-1, 4),
-        ignore=np.array([row[3] for row in rows], np.bool_),
+        np.array([object_row[0] for object_row in chosen_rows], np.int32),
+        np.array([object_row[1] for object_row in chosen_rows], np.int32),
+        np.array([object_row[2] for object_row in chosen_rows], np.float64).reshape(-1, 4),
+        ignore=np.array([object_row[3] for object_row in chosen_rows], np.bool_),
     )
 
 
@@ -98,7 +98,7 @@ def find_boxes(detector: Detector, images: Iterable[tuple[int, U8, Photograph]],
         CellError: A 3D detector is shown a photograph without a camera matrix.
     """
     label_table = torch.tensor([road_label(name) for name in detector.classes])
-    parts: list[tuple[Any, ...]] = []
+    columns_by_image: list[tuple[Any, ...]] = []
     for number, image, photograph in images:
         intrinsic = None
         if detector.task == "3d":
@@ -108,13 +108,21 @@ def find_boxes(detector: Detector, images: Iterable[tuple[int, U8, Photograph]],
                     "KITTI (with calib) or nuScenes"
                 )
             intrinsic = torch.from_numpy(photograph.intrinsic).float()[None].to(device)
-        (found,) = detector.predict(to_images([image], device), intrinsic, threshold=THRESHOLD)
-        label = label_table[found.label.cpu().long()]
-        rows = label >= 0
-        columns = (label[rows], found.box.detach().cpu().double()[rows], found.score.detach().cpu().double()[rows])
-        parts.append((np.full(int(rows.sum()), number, np.int32), *(column.numpy() for column in columns)))
+        (detections,) = detector.predict(to_images([image], device), intrinsic, threshold=THRESHOLD)
+        label = label_table[detections.label.cpu().long()]
+        chosen_rows = label >= 0
+        columns = (
+            label[chosen_rows],
+            detections.box.detach().cpu().double()[chosen_rows],
+            detections.score.detach().cpu().double()[chosen_rows],
+        )
+        columns_by_image.append(
+            (np.full(int(chosen_rows.sum()), number, np.int32), *(column.numpy() for column in columns))
+        )
     image_index, labels, boxes, scores = (
-        np.concatenate([part[column] for part in parts]) if parts else np.zeros((0, 4) if column == 2 else 0)
+        np.concatenate([image_columns[column] for image_columns in columns_by_image])
+        if columns_by_image
+        else np.zeros((0, 4) if column == 2 else 0)
         for column in range(4)
     )
     return PhotographBoxes(image_index.astype(np.int32), labels.astype(np.int32), boxes, scores)
@@ -125,19 +133,19 @@ def boxes_file(system: str, condition: str) -> str:
     return f"boxes/{digest('photograph boxes', system, condition)[:16]}.npz"
 
 
-def kept_boxes(path: Path, find: Callable[[], PhotographBoxes]) -> PhotographBoxes:
+def kept_boxes(path: Path, find_condition: Callable[[], PhotographBoxes]) -> PhotographBoxes:
     """Return boxes from their file, which is written first if there is none.
 
     Args:
         path: The file.
-        find: Finds the boxes.
+        find_condition: Finds the boxes.
 
     Raises:
         FormatError: The file is broken.
     """
     if not path.is_file():
-        found = find()
+        detections = find_condition()
         safeio.make_folder(path.parent)
-        safeio.save_npz(path, {name: getattr(found, name) for name in PhotographBoxes.__dataclass_fields__})
+        safeio.save_npz(path, {name: getattr(detections, name) for name in PhotographBoxes.__dataclass_fields__})
     arrays = safeio.load_npz(path)
     return PhotographBoxes(arrays["image"], arrays["label"], arrays["box"], arrays["score"])

@@ -61,11 +61,11 @@ def write_sheets(plan: Plan, folder: Path, photographs: Sequence[Photograph], ca
                 f"{label_of(system)} on photographs: boxes of at least {plan.suite.score:g} (orange) and annotated "
                 "objects (white; grey: ignored)."
             )
-            for index, texture in enumerate(plan.suite.textures):
+            for position, texture in enumerate(plan.suite.textures):
                 worn_cells = [cell for cell in cells if cell.spec["texture"] == texture]
                 sheet = worn_sheet(worn_cells, folder, photographs, cars, clean)
                 if sheet is not None:
-                    path = folder / "pictures" / f"{number + 1}-{index + 1}-worn.jpg"
+                    path = folder / "pictures" / f"{number + 1}-{position + 1}-worn.jpg"
                     save_picture(path, sheet)
                     captions[path.name] = (
                         f"{worn_cells[0].fields['texture']} on cars in photographs, and its controls; the scores are "
@@ -90,20 +90,22 @@ def photograph_sheet(photographs: Sequence[Photograph], boxes: PhotographBoxes, 
         score: Least score of a box that is drawn.
     """
     richest = sorted(range(len(photographs)), key=lambda number: -int((~photographs[number].ignored).sum()))[:SHOWN]
-    tiles = []
+    sheet_tiles = []
     for number in sorted(richest):
         photograph = photographs[number]
-        image = photograph.read()
-        scale = WIDTH / image.shape[1]
-        canvas = cv2.resize(image, (WIDTH, round(scale * image.shape[0])), interpolation=cv2.INTER_AREA)
-        for box, is_ignored in zip(photograph.box * scale, photograph.ignored.tolist(), strict=True):
-            _rectangle(canvas, box, (128, 128, 128) if is_ignored else TRUE, 1)
+        photograph_image = photograph.read()
+        scale = WIDTH / photograph_image.shape[1]
+        canvas = cv2.resize(
+            photograph_image, (WIDTH, round(scale * photograph_image.shape[0])), interpolation=cv2.INTER_AREA
+        )
+        for object_box, is_ignored in zip(photograph.box * scale, photograph.ignored.tolist(), strict=True):
+            _rectangle(canvas, object_box, (128, 128, 128) if is_ignored else TRUE, 1)
         rows = (boxes.image == number) & (boxes.score >= score)
-        for box, label, value in zip(boxes.box[rows] * scale, boxes.label[rows], boxes.score[rows], strict=True):
-            _rectangle(canvas, box, FOUND, 2)
-            _write(canvas, f"{ROAD_CLASSES[label]} {value:.2f}", box)
-        tiles.append(add_caption(canvas, photograph.name, WIDTH))
-    return _grid(tiles, COLUMNS)
+        for object_box, label, value in zip(boxes.box[rows] * scale, boxes.label[rows], boxes.score[rows], strict=True):
+            _rectangle(canvas, object_box, FOUND, 2)
+            _write(canvas, f"{ROAD_CLASSES[label]} {value:.2f}", object_box)
+        sheet_tiles.append(add_caption(canvas, photograph.name, WIDTH))
+    return _grid(sheet_tiles, COLUMNS)
 
 
 def worn_sheet(
@@ -122,68 +124,76 @@ def worn_sheet(
         cars: The cars that wear textures.
         clean: Boxes in the clean photographs.
     """
-    highest = sorted(cars, key=lambda car: -float(_height(photographs, car)))[:SHOWN_CARS]
+    highest = sorted(cars, key=lambda wearing_car: -float(_height(photographs, wearing_car)))[:SHOWN_CARS]
     finished = [cell for cell in cells if (folder / boxes_file(cell.system, f"{cell.key} 0")).is_file()]
     if not highest or not finished:
         return None
     variants: list[tuple[str, dict[int, U8], F64]] = [
         (
             "clean",
-            {car.image: photographs[car.image].read() for car in highest},
+            {wearing_car.image: photographs[wearing_car.image].read() for wearing_car in highest},
             car_scores(photographs, highest, clean),
         )
     ]
     for cell in finished:
         worn = face_print(cell.spec["texture"])
         colour = drawn_colour(worn, cell.fields["pasted"], 0)
-        chosen = [car for car in cars if car.image in variants[0][1]]
-        images = {number: image for number, image, _ in worn_images(photographs, chosen, worn, colour)}
+        chosen = [wearing_car for wearing_car in cars if wearing_car.image in variants[0][1]]
+        images = {
+            number: photograph_image for number, photograph_image, _ in worn_images(photographs, chosen, worn, colour)
+        }
         boxes = kept_boxes(folder / boxes_file(cell.system, f"{cell.key} 0"), _absent)
         title = cell.fields["texture"] if cell.fields["pasted"] == TRAINED else cell.fields["pasted"]
         variants.append((title, images, car_scores(photographs, highest, boxes)))
-    tiles = []
-    for index, car in enumerate(highest):
+    sheet_tiles = []
+    for position, wearing_car in enumerate(highest):
         for title, images, scores in variants:
-            crop = _crop(images[car.image], photographs[car.image].box[car.row])
-            tiles.append(add_caption(crop, f"{title}: {scores[index]:.2f}", CAR_WIDTH))
-    return _grid(tiles, len(variants))
+            crop = _crop(images[wearing_car.image], photographs[wearing_car.image].box[wearing_car.row])
+            sheet_tiles.append(add_caption(crop, f"{title}: {scores[position]:.2f}", CAR_WIDTH))
+    return _grid(sheet_tiles, len(variants))
 
 
-def _height(photographs: Sequence[Photograph], car: WornCar) -> Any:
-    box = photographs[car.image].box[car.row]
-    return box[3] - box[1]
+def _height(photographs: Sequence[Photograph], wearing_car: WornCar) -> Any:
+    object_box = photographs[wearing_car.image].box[wearing_car.row]
+    return object_box[3] - object_box[1]
 
 
-def _crop(image: U8, box: F64) -> U8:
-    height, width = image.shape[:2]
-    side = int(min(AROUND * (box[2:] - box[:2]).max(), height, width))
-    left = int(np.clip((box[0] + box[2] - side) / 2, 0, width - side))
-    top = int(np.clip((box[1] + box[3] - side) / 2, 0, height - side))
-    part = np.ascontiguousarray(image[top : top + side, left : left + side])
+def _crop(photograph_image: U8, object_box: F64) -> U8:
+    height, sheet_width = photograph_image.shape[:2]
+    side = int(min(AROUND * (object_box[2:] - object_box[:2]).max(), height, sheet_width))
+    left = int(np.clip((object_box[0] + object_box[2] - side) / 2, 0, sheet_width - side))
+    top = int(np.clip((object_box[1] + object_box[3] - side) / 2, 0, height - side))
+    part = np.ascontiguousarray(photograph_image[top : top + side, left : left + side])
     return np.asarray(cv2.resize(part, (CAR_WIDTH, CAR_WIDTH), interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-def _grid(tiles: list[U8], columns: int) -> U8:
+def _grid(sheet_tiles: list[U8], columns: int) -> U8:
     """Return tiles side by side in rows; tiles of a row are padded to one height, rows to one width."""
     rows = []
-    for start in range(0, len(tiles), columns):
-        row_tiles = tiles[start : start + columns]
-        height = max(tile.shape[0] for tile in row_tiles)
-        padded = [np.pad(tile, ((0, height - len(tile)), (0, 0), (0, 0)), constant_values=255) for tile in row_tiles]
+    for start in range(0, len(sheet_tiles), columns):
+        row_tiles = sheet_tiles[start : start + columns]
+        height = max(sheet_tile.shape[0] for sheet_tile in row_tiles)
+        padded = [
+            np.pad(sheet_tile, ((0, height - len(sheet_tile)), (0, 0), (0, 0)), constant_values=255)
+            for sheet_tile in row_tiles
+        ]
         rows.append(np.concatenate(padded, 1))
-    width = max(row.shape[1] for row in rows)
+    sheet_width = max(sheet_row.shape[1] for sheet_row in rows)
     return np.concatenate(
-        [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+        [
+            np.pad(sheet_row, ((0, 0), (0, sheet_width - sheet_row.shape[1]), (0, 0)), constant_values=255)
+            for sheet_row in rows
+        ]
     )
 
 
-def _rectangle(canvas: U8, box: F64, colour: tuple[int, int, int], width: int) -> None:
-    left, top, right, bottom = (round(float(edge)) for edge in box)
-    cv2.rectangle(canvas, (left, top), (right, bottom), colour, width, cv2.LINE_AA)
+def _rectangle(canvas: U8, object_box: F64, colour: tuple[int, int, int], sheet_width: int) -> None:
+    left, top, right, bottom = (round(float(edge)) for edge in object_box)
+    cv2.rectangle(canvas, (left, top), (right, bottom), colour, sheet_width, cv2.LINE_AA)
 
 
-def _write(canvas: U8, text: str, box: F64) -> None:
-    position = (round(float(box[0])), max(round(float(box[1])) - 4, 12))
+def _write(canvas: U8, text: str, object_box: F64) -> None:
+    position = (round(float(object_box[0])), max(round(float(object_box[1])) - 4, 12))
     # A dark outline first, so that the text is readable on any background.
-    for colour, width in (((0, 0, 0), 3), (FOUND, 1)):
-        cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, width, cv2.LINE_AA)
+    for colour, sheet_width in (((0, 0, 0), 3), (FOUND, 1)):
+        cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, sheet_width, cv2.LINE_AA)

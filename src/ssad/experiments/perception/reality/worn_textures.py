@@ -46,25 +46,25 @@ def wearing_cars(photographs: Sequence[Photograph], min_height: float) -> list[W
     cars = []
     for number, photograph in enumerate(photographs):
         height, width = (0, 0) if not len(photograph.label) else photograph.read().shape[:2]
-        for row in range(len(photograph.label)):
-            if _is_car(photograph, row) and _is_clear(photograph, row, (width, height), min_height):
-                cars.append(WornCar(number, row))
+        for object_row in range(len(photograph.label)):
+            if _is_car(photograph, object_row) and _is_clear(photograph, object_row, (width, height), min_height):
+                cars.append(WornCar(number, object_row))
     return cars
 
 
-def _is_car(photograph: Photograph, row: int) -> bool:
-    label = int(photograph.label[row])
+def _is_car(photograph: Photograph, object_row: int) -> bool:
+    label = int(photograph.label[object_row])
     return label >= 0 and road_label(CLASSES[label]) == CAR
 
 
-def _is_clear(photograph: Photograph, row: int, size: tuple[int, int], min_height: float) -> bool:
-    box = photograph.box[row]
+def _is_clear(photograph: Photograph, object_row: int, size: tuple[int, int], min_height: float) -> bool:
+    box = photograph.box[object_row]
     limits = np.array([BORDER, BORDER, size[0] - BORDER, size[1] - BORDER])
     if box[3] - box[1] < min_height or (box[:2] < limits[:2]).any() or (box[2:] > limits[2:]).any():
         return False
-    if face_quad(WHOLE_FACE, box, photograph.solid[row], photograph.intrinsic) is None:
+    if face_quad(WHOLE_FACE, box, photograph.solid[object_row], photograph.intrinsic) is None:
         return False
-    others = np.delete(photograph.box, row, 0)
+    others = np.delete(photograph.box, object_row, 0)
     nearer = others[others[:, 3] > box[3]]
     sides = np.minimum(nearer[:, 2:], box[2:]) - np.maximum(nearer[:, :2], box[:2])
     covered = np.where((sides > 0).all(1), sides.prod(1), 0.0) / (box[2:] - box[:2]).prod()
@@ -89,12 +89,12 @@ def worn_images(
     photographs: Sequence[Photograph], cars: Sequence[WornCar], worn: FacePrint, colour: Tensor
 ) -> Iterator[tuple[int, U8, Photograph]]:
     """Yield index, pixels and photograph of each photograph with cars, all of which wear a print."""
-    for number in dict.fromkeys(car.image for car in cars):
+    for number in dict.fromkeys(wearing_car.image for wearing_car in cars):
         photograph = photographs[number]
         clean = image = photograph.read()
-        for row in (car.row for car in cars if car.image == number):
-            box = photograph.box[row]
-            quad = face_quad(worn.rectangle, box, photograph.solid[row], photograph.intrinsic)
+        for object_row in (wearing_car.row for wearing_car in cars if wearing_car.image == number):
+            box = photograph.box[object_row]
+            quad = face_quad(worn.rectangle, box, photograph.solid[object_row], photograph.intrinsic)
             if quad is not None:
                 image = paste(image, colour, worn.mask, quad, light=light_on(clean, box))
         yield number, image, photograph
@@ -103,12 +103,12 @@ def worn_images(
 def car_scores(photographs: Sequence[Photograph], cars: Sequence[WornCar], boxes: PhotographBoxes) -> F64:
     """Return the score with which each car is found [N]; 0 if it is not. No box finds two cars."""
     scores_by_car: dict[tuple[int, int], float] = {}
-    for number in dict.fromkeys(car.image for car in cars):
+    for number in dict.fromkeys(wearing_car.image for wearing_car in cars):
         photograph = photographs[number]
-        rows = [row for row in range(len(photograph.label)) if _is_car(photograph, row)]
-        found, scores = boxes.of(number, CAR)
-        sighting = TargetSighting("", found, scores, photograph.box[rows], np.zeros(len(rows), np.bool_))
+        rows = [object_row for object_row in range(len(photograph.label)) if _is_car(photograph, object_row)]
+        found_boxes, scores = boxes.of(number, CAR)
+        sighting = TargetSighting("", found_boxes, scores, photograph.box[rows], np.zeros(len(rows), np.bool_))
         scores_by_car |= {
-            (number, row): score for row, score in zip(rows, sighting.confidences().tolist(), strict=True)
+            (number, object_row): score for object_row, score in zip(rows, sighting.confidences().tolist(), strict=True)
         }
-    return np.array([scores_by_car[car.image, car.row] for car in cars])
+    return np.array([scores_by_car[wearing_car.image, wearing_car.row] for wearing_car in cars])

@@ -206,18 +206,24 @@ def low_beam(across: float, down: float) -> float:
     and rises by 15 degrees on the right, as UN Regulation No. 112 draws it for right-hand traffic; the intensities meet
     its limits for a lamp of class B with a peak of 12,000 cd.
     """
-    right = wp.atan(across) * 57.29578
-    up = -wp.atan(down) * 57.29578
-    above = up + 0.57 - wp.min(0.268 * wp.max(right, 0.0), 1.1)
-    edge = wp.clamp(0.5 - 2.5 * above, 0.0, 1.0)
-    edge = edge * edge * (3.0 - 2.0 * edge)
-    fade = wp.clamp((BEAM_EDGE - wp.sqrt(across * across + down * down)) / 0.15, 0.0, 1.0)
-    wide = fade * wp.exp(-0.5 * right * right / 484.0)
-    light = 0.018 * wide * wp.exp(-0.25 * wp.max(above, 0.0))
-    if edge > 0.0:
-        below = wp.min(above, 0.0)
-        hot = wp.exp(-0.5 * right * right / 49.0) * wp.exp(below / 3.0)
-        light += edge * (hot + 0.12 * wide * wp.exp(below / 8.0))
+    squared_radius = across * across + down * down
+    if squared_radius >= BEAM_EDGE * BEAM_EDGE:
+        return 0.0
+    # Degrees; towards the edge, tangents of angles serve as well.
+    right = across * 57.29578
+    above = 0.57 - down * 57.29578 - wp.min(0.268 * wp.max(right, 0.0), 1.1)
+    fade = wp.min(5.0 * (BEAM_EDGE * BEAM_EDGE - squared_radius), 1.0)
+    light = 0.018 * fade
+    # Most points lie above the cut-off, where only stray light goes.
+    if above < 0.2:
+        edge = wp.min(0.5 - 2.5 * above, 1.0)
+        edge = edge * edge * (3.0 - 2.0 * edge)
+        below = wp.max(-above, 0.0)
+        squared_right = right * right
+        ridge = 1.0 + squared_right / 98.0
+        hot = 1.0 / (ridge * ridge * (1.0 + below / 3.0 + below * below / 12.0))
+        wide = fade / ((1.0 + squared_right / 968.0) * (1.0 + below / 8.0 + below * below / 100.0))
+        light += edge * (hot + 0.12 * wide)
     return light
 
 

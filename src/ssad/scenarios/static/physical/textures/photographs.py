@@ -68,34 +68,40 @@ def face_print(texture: str) -> FacePrint:
     target = parse_target(printed.target)
     if not isinstance(target, TargetCar):
         raise ConfigError(f"texture '{texture}': it is made for {printed.target}; only cars in photographs wear one")
-    mesh = target.mesh()
-    surface = printed.on(mesh)
+    body_mesh = target.mesh()
+    surface = printed.on(body_mesh)
     if not isinstance(surface.layer, TextureLayer):
         raise ConfigError(f"texture '{texture}': it lies beside the car; only what is on its rear can be pasted")
-    panel = mesh.panel_rectangle(PANEL)
+    panel = body_mesh.panel_rectangle(PANEL)
     u0, v0, u1, v1 = surface.layer.rectangle
-    part = (max(u0, panel[0]), max(v0, panel[1]), min(u1, panel[2]), min(v1, panel[3]))
-    if part[2] <= part[0] or part[3] <= part[1]:
+    atlas_part = (max(u0, panel[0]), max(v0, panel[1]), min(u1, panel[2]), min(v1, panel[3]))
+    if atlas_part[2] <= atlas_part[0] or atlas_part[3] <= atlas_part[1]:
         raise ConfigError(f"texture '{texture}': it does not lie on the {PANEL} of the car")
-    _, height, width = printed.colour.shape
-    left, right = (round((u - u0) / (u1 - u0) * width) for u in (part[0], part[2]))
-    top, bottom = (round((v - v0) / (v1 - v0) * height) for v in (part[1], part[3]))
-    crop = np.s_[top : max(bottom, top + 1), left : max(right, left + 1)]
-    return FacePrint(printed.colour[:, *crop].contiguous(), surface.mask[crop], _share_rectangle(mesh, part))
+    _, pixel_height, pixel_width = printed.colour.shape
+    left, right = (round((u - u0) / (u1 - u0) * pixel_width) for u in (atlas_part[0], atlas_part[2]))
+    top, bottom = (round((v - v0) / (v1 - v0) * pixel_height) for v in (atlas_part[1], atlas_part[3]))
+    texel_crop = np.s_[top : max(bottom, top + 1), left : max(right, left + 1)]
+    return FacePrint(
+        printed.colour[:, *texel_crop].contiguous(), surface.mask[texel_crop], _share_rectangle(body_mesh, atlas_part)
+    )
 
 
-def _share_rectangle(mesh: Mesh, part: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+def _share_rectangle(
+    body_mesh: Mesh, atlas_part: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
     """Return where a rectangle of the atlas lies on the rear of a body, in shares of the rear of its box."""
-    is_rear = np.isin(mesh.panel, mesh.panel_indices(PANEL))
-    uv = mesh.uv[is_rear].reshape(-1, 2).astype(np.float64)
-    corners = mesh.corners()[is_rear].reshape(-1, 3).astype(np.float64)
-    lowest, highest = mesh.bounds()
+    is_rear = np.isin(body_mesh.panel, body_mesh.panel_indices(PANEL))
+    texture_points = body_mesh.uv[is_rear].reshape(-1, 2).astype(np.float64)
+    corners = body_mesh.corners()[is_rear].reshape(-1, 3).astype(np.float64)
+    lowest, highest = body_mesh.bounds()
     # From behind, the body's left (+y) is at the left.
     shares = np.stack([highest[1] - corners[:, 1], highest[2] - corners[:, 2]], -1) / (highest[1:] - lowest[1:])
-    design = np.concatenate([uv, np.ones((len(uv), 1))], 1)
-    fit, *_ = np.linalg.lstsq(design, shares, rcond=None)
-    (x0, y0), (x1, y1) = np.array([[part[0], part[1], 1.0], [part[2], part[3], 1.0]]) @ fit
-    return float(x0), float(y0), float(x1), float(y1)
+    design = np.concatenate([texture_points, np.ones((len(texture_points), 1))], 1)
+    affine_fit, *_ = np.linalg.lstsq(design, shares, rcond=None)
+    (left_share, top_share), (right_share, bottom_share) = (
+        np.array([[atlas_part[0], atlas_part[1], 1.0], [atlas_part[2], atlas_part[3], 1.0]]) @ affine_fit
+    )
+    return float(left_share), float(top_share), float(right_share), float(bottom_share)
 
 
 def face_quad(rectangle: tuple[float, float, float, float], box: F64, solid: F64, intrinsic: F64 | None) -> F64 | None:
@@ -110,12 +116,18 @@ def face_quad(rectangle: tuple[float, float, float, float], box: F64, solid: F64
     Returns:
         Upper left, upper right, lower right and lower left corner [4, 2], pixels; None for a car seen from the side.
     """
-    x0, y0, x1, y1 = rectangle
-    shares = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    left_share, top_share, right_share, bottom_share = rectangle
+    shares = np.array(
+        [[left_share, top_share], [right_share, top_share], [right_share, bottom_share], [left_share, bottom_share]]
+    )
     if intrinsic is None or not np.isfinite(solid).all():
-        width, height = box[2] - box[0], box[3] - box[1]
-        return None if width > MAX_RATIO * height else np.asarray(box[:2] + shares * np.array([width, height]))
-    centre, (length, height, width) = solid[:3], solid[3:6]
+        pixel_width, pixel_height = box[2] - box[0], box[3] - box[1]
+        return (
+            None
+            if pixel_width > MAX_RATIO * pixel_height
+            else np.asarray(box[:2] + shares * np.array([pixel_width, pixel_height]))
+        )
+    centre, (length, pixel_height, pixel_width) = solid[:3], solid[3:6]
     forward, left, up = camera_axes(solid[6:7])[0].T
     is_front = bool(forward @ centre < 0)
     normal = forward if is_front else -forward
@@ -123,7 +135,7 @@ def face_quad(rectangle: tuple[float, float, float, float], box: F64, solid: F64
     if normal @ -middle < MIN_FACING * np.linalg.norm(middle):
         return None
     to_left = -left if is_front else left
-    points = middle + (0.5 - shares[:, :1]) * width * to_left + (0.5 - shares[:, 1:]) * height * up
+    points = middle + (0.5 - shares[:, :1]) * pixel_width * to_left + (0.5 - shares[:, 1:]) * pixel_height * up
     if points[:, 2].min() <= 0.5:
         return None
     projected = points @ intrinsic.T
@@ -140,17 +152,17 @@ def paste(image: U8, colour: Tensor, mask: Bool, quad: F64, *, light: F32) -> U8
         quad: Corners of the print in the photograph [4, 2], pixels, as `face_quad` returns them.
         light: Light on the print, linear RGB [3] (`light_on`).
     """
-    height, width = image.shape[:2]
-    low = np.clip(np.floor(quad.min(0)).astype(int), 0, (width, height))
-    high = np.clip(np.ceil(quad.max(0)).astype(int), 0, (width, height))
-    columns, rows = (int(length) for length in high - low)
+    pixel_height, pixel_width = image.shape[:2]
+    lower_corner = np.clip(np.floor(quad.min(0)).astype(int), 0, (pixel_width, pixel_height))
+    upper_corner = np.clip(np.ceil(quad.max(0)).astype(int), 0, (pixel_width, pixel_height))
+    columns, rows = (int(length) for length in upper_corner - lower_corner)
     if columns < 1 or rows < 1:
         return image.copy()
-    cover = mask[..., None].astype(np.float32)
-    print_layer = np.concatenate([albedo_of(colour).permute(1, 2, 0).numpy() * cover, cover], 2)
+    mask_layer = mask[..., None].astype(np.float32)
+    print_layer = np.concatenate([albedo_of(colour).permute(1, 2, 0).numpy() * mask_layer, mask_layer], 2)
     texels = np.array([[0, 0], [mask.shape[1], 0], [mask.shape[1], mask.shape[0]], [0, mask.shape[0]]])
     # OpenCV's pixel centres are whole numbers.
-    corners = (quad - low) * SAMPLES - 0.5
+    corners = (quad - lower_corner) * SAMPLES - 0.5
     transform = cv2.getPerspectiveTransform((texels - 0.5).astype(np.float32), corners.astype(np.float32))
     size = (columns * SAMPLES, rows * SAMPLES)
     warped = cv2.warpPerspective(print_layer, transform, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -159,7 +171,7 @@ def paste(image: U8, colour: Tensor, mask: Bool, quad: F64, *, light: F32) -> U8
     cv2.fillConvexPoly(inside, np.rint(corners * 16).astype(np.int32), 1.0, cv2.LINE_8, 4)
     warped *= inside[..., None]
     averaged = cv2.resize(warped, (columns, rows), interpolation=cv2.INTER_AREA)
-    window = np.s_[low[1] : high[1], low[0] : high[0]]
+    window = np.s_[lower_corner[1] : upper_corner[1], lower_corner[0] : upper_corner[0]]
     lit = np.minimum(averaged[..., :3] * light, averaged[..., 3:])
     pasted = image.copy()
     pasted[window] = _srgb(_linear(image[window]) * (1 - averaged[..., 3:]) + lit)
@@ -168,11 +180,11 @@ def paste(image: U8, colour: Tensor, mask: Bool, quad: F64, *, light: F32) -> U8
 
 def light_on(image: U8, box: F64) -> F32:
     """Return the light on a car, linear RGB [3]: that under which its surroundings have the mean of a grey world."""
-    height, width = image.shape[:2]
+    pixel_height, pixel_width = image.shape[:2]
     centre, sides = (box[:2] + box[2:]) / 2, SURROUNDINGS * (box[2:] - box[:2]) / 2
-    low = np.clip(np.floor(centre - sides).astype(int), 0, (width - 1, height - 1))
-    high = np.clip(np.ceil(centre + sides).astype(int), low + 1, (width, height))
-    mean = _linear(image[low[1] : high[1], low[0] : high[0]]).reshape(-1, 3).mean(0)
+    lower_corner = np.clip(np.floor(centre - sides).astype(int), 0, (pixel_width - 1, pixel_height - 1))
+    upper_corner = np.clip(np.ceil(centre + sides).astype(int), lower_corner + 1, (pixel_width, pixel_height))
+    mean = _linear(image[lower_corner[1] : upper_corner[1], lower_corner[0] : upper_corner[0]]).reshape(-1, 3).mean(0)
     # Brightness alone: the colours of few objects say little about the colour of the light.
     return np.full(3, mean @ np.array([0.2126, 0.7152, 0.0722]) / GREY_WORLD, np.float32)
 
