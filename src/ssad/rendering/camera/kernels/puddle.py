@@ -34,33 +34,33 @@ def mirror_pixels(
     focal = lens[view_index]
     width = depth.shape[2]
     eye = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
-    across = wp.vec3(pose[0, 0], pose[1, 0], pose[2, 0])
-    down = wp.vec3(pose[0, 1], pose[1, 1], pose[2, 1])
-    axis = wp.vec3(pose[0, 2], pose[1, 2], pose[2, 2])
+    rightward = wp.vec3(pose[0, 0], pose[1, 0], pose[2, 0])
+    downward = wp.vec3(pose[0, 1], pose[1, 1], pose[2, 1])
+    optical_axis = wp.vec3(pose[0, 2], pose[1, 2], pose[2, 2])
     pixel_row = row_index * ROWS
     if eye[2] <= LOWEST:
         return
     for column in range(first_column, width, lanes):
         distance_ahead = depth[view_index, pixel_row, column]
         ray = wp.vec3((float(column) - focal[2]) / focal[0], (float(pixel_row) - focal[3]) / focal[1], 1.0)
-        ahead = across * ray[0] + down * ray[1] + axis
+        ahead = rightward * ray[0] + downward * ray[1] + optical_axis
         mirrored = wp.vec3(ahead[0], ahead[1], -ahead[2]) * 1.0e5
         height = ahead[2]
         if distance_ahead < 1.0e9:
             point = eye + ahead * distance_ahead
             height = point[2] - LOWEST
             mirrored = wp.vec3(point[0], point[1], -point[2]) - eye
-        distance = wp.dot(mirrored, axis)
+        distance = wp.dot(mirrored, optical_axis)
         if height > 0.0 and distance > 0.05:
-            mirrored_column = wp.dot(mirrored, across) / distance * focal[0] + focal[2]
-            mirrored_row = wp.dot(mirrored, down) / distance * focal[1] + focal[3]
+            mirrored_column = wp.dot(mirrored, rightward) / distance * focal[0] + focal[2]
+            mirrored_row = wp.dot(mirrored, downward) / distance * focal[1] + focal[3]
             if (
                 mirrored_column > -0.5
                 and mirrored_row > -0.5
                 and mirrored_column < float(width) - 0.5
                 and mirrored_row < float(depth.shape[1]) - 0.5
             ):
-                key = (wp.uint64(wp.cast(1.0 / distance, wp.uint32)) << wp.uint64(32)) | wp.uint64(
+                mirror_key = (wp.uint64(wp.cast(1.0 / distance, wp.uint32)) << wp.uint64(32)) | wp.uint64(
                     pixel_row * width + column
                 )
                 wp.atomic_max(
@@ -68,7 +68,7 @@ def mirror_pixels(
                     view_index,
                     wp.min(int(mirrored_row + 0.5) / ROWS, keys.shape[1] - 1),
                     int(mirrored_column + 0.5),
-                    key,
+                    mirror_key,
                 )
 
 
@@ -79,12 +79,12 @@ def mirrored_pixel(
     """Return the light of a pixel of the mirror image, and one over its depth; all 0 where it is empty."""
     if column < 0 or column >= keys.shape[2]:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    key = keys[view_index, row_index, column]
-    if key == NONE:
+    mirror_key = keys[view_index, row_index, column]
+    if mirror_key == NONE:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    index = int(key & LAST)
+    index = int(mirror_key & LAST)
     colour = source[view_index, index / source.shape[2], index % source.shape[2]]
-    return wp.vec4(colour[0], colour[1], colour[2], wp.cast(wp.uint32(key >> wp.uint64(32)), float))
+    return wp.vec4(colour[0], colour[1], colour[2], wp.cast(wp.uint32(mirror_key >> wp.uint64(32)), float))
 
 
 @wp.kernel
@@ -123,24 +123,24 @@ def sum_columns(
 def part_of(row_index: float, count: int) -> wp.vec2:
     """Return a position between rows, clamped to 0..count: its row, and the share of the next."""
     position = wp.clamp(row_index, 0.0, float(count))
-    first = wp.min(wp.floor(position), float(count - 1))
-    return wp.vec2(first, position - first)
+    first_row = wp.min(wp.floor(position), float(count - 1))
+    return wp.vec2(first_row, position - first_row)
 
 
 @wp.func(inline=True)
 def sum_up_to(sums: wp.array3d(dtype=wp.vec4), view_index: int, row_index: float, column: int) -> wp.vec4:
     """Return the sum over the rows above a position."""
     part = part_of(row_index, sums.shape[1] - 1)
-    first = int(part[0])
-    return sums[view_index, first, column] * (1.0 - part[1]) + sums[view_index, first + 1, column] * part[1]
+    first_row = int(part[0])
+    return sums[view_index, first_row, column] * (1.0 - part[1]) + sums[view_index, first_row + 1, column] * part[1]
 
 
 @wp.func(inline=True)
 def count_up_to(counts: wp.array3d(dtype=float), view_index: int, row_index: float, column: int) -> float:
     """Return the number of pixels above a position."""
     part = part_of(row_index, counts.shape[1] - 1)
-    first = int(part[0])
-    return counts[view_index, first, column] * (1.0 - part[1]) + counts[view_index, first + 1, column] * part[1]
+    first_row = int(part[0])
+    return counts[view_index, first_row, column] * (1.0 - part[1]) + counts[view_index, first_row + 1, column] * part[1]
 
 
 @wp.kernel
@@ -165,26 +165,26 @@ def add_mirror_image(
                 counts, view_index, centre - widest, column
             )
             if count > 0.01:
-                near = sum_up_to(sums, view_index, centre + widest, column) - sum_up_to(
+                nearest_light = sum_up_to(sums, view_index, centre + widest, column) - sum_up_to(
                     sums, view_index, centre - widest, column
                 )
                 # Water close to what it mirrors blurs it less.
-                share = wp.clamp(1.0 - depth[view_index, pixel_row, column] * near[3] / count, 0.0, 1.0)
-                half = wp.max(widest * share, 0.75)
-                inner = 0.5 * half
-                total = sum_up_to(sums, view_index, centre + half, column) - sum_up_to(
-                    sums, view_index, centre - half, column
+                share = wp.clamp(1.0 - depth[view_index, pixel_row, column] * nearest_light[3] / count, 0.0, 1.0)
+                half_height = wp.max(widest * share, 0.75)
+                inner = 0.5 * half_height
+                total = sum_up_to(sums, view_index, centre + half_height, column) - sum_up_to(
+                    sums, view_index, centre - half_height, column
                 )
                 total += sum_up_to(sums, view_index, centre + inner, column) - sum_up_to(
                     sums, view_index, centre - inner, column
                 )
-                found = count_up_to(counts, view_index, centre + half, column) - count_up_to(
-                    counts, view_index, centre - half, column
+                pixel_count = count_up_to(counts, view_index, centre + half_height, column) - count_up_to(
+                    counts, view_index, centre - half_height, column
                 )
-                found += count_up_to(counts, view_index, centre + inner, column) - count_up_to(
+                pixel_count += count_up_to(counts, view_index, centre + inner, column) - count_up_to(
                     counts, view_index, centre - inner, column
                 )
-                if found > 0.01:
-                    cover = wp.min(found / (2.0 * (half + inner)), 1.0)
-                    image = wp.vec3(total[0], total[1], total[2]) * (water[3] / found)
+                if pixel_count > 0.01:
+                    cover = wp.min(pixel_count / (2.0 * (half_height + inner)), 1.0)
+                    image = wp.vec3(total[0], total[1], total[2]) * (water[3] / pixel_count)
                     radiance[view_index, pixel_row, column] += (image - wp.vec3(water[0], water[1], water[2])) * cover
