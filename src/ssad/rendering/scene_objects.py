@@ -465,13 +465,14 @@ def _add_parked_vehicles(
         size = draw_size(body_kind, style, generator=prop_rng)
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
         lateral_offset = 0.0
+        towing = towing_vehicle(style, size) if body_kind == "trailer" else None
         if spot_index >= len(parking_lots):
             _, _, _, depth, room = bays[spot_index - len(parking_lots)]
             lateral_offset = size[1] / 2 + BAY_EDGE
-            if lateral_offset + size[1] / 2 > depth or size[0] / 2 > room:
+            length = size[0] if towing is None else towing.length
+            if lateral_offset + size[1] / 2 > depth or length / 2 > room:
                 continue  # it would stand on the pavement
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
-        towing = towing_vehicle(style, size) if body_kind == "trailer" else None
         room = PARKED[body_kind][1] if towing is None else towing.length + TRAILER_GAP
         if not clear.is_free(x, y, yaw, room, size[1]):
             continue
