@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ssad.core.images import read_image
 from ssad.core.safeio import make_folder
-from ssad.experiments.perception.physical.page import PhysicalRun, lower, margin_table, title_of
+from ssad.experiments.perception.physical.page import margin_table
+from ssad.experiments.perception.physical.physical_run import PhysicalRun, lower, title_of
 from ssad.rendering.target import class_of_target, parse_target
 from ssad.report.load import load_run
 from ssad.scenarios.static.physical.textures.card import SHIPPED, TextureCard, save_texture
@@ -28,7 +30,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
     run = load_run(folder)
     suite, weights = run.suite, run.header["weights"]
     margins = {row.head[:3]: lower(row.cells[2]) for row in margin_table(PhysicalRun(run)).rows}
-    found: dict[str, tuple[dict[str, Any], TextureCard]] = {}
+    found: dict[str, tuple[Mapping[str, Any], TextureCard]] = {}
     for line in run.lines:
         own = line["status"] == "ok" and line["view"] == "drive" and line["detector"] == line["source"]
         attack = line["attack"].replace(", ", "-").replace(" ", "-")

@@ -187,7 +187,7 @@ def test_an_approach_sees_each_distance_in_turn_and_no_bends(
     """Every image that is missing is proposed from the distance that falls to it, again and again."""
     monkeypatch.setattr(target_images, "has_free_sight", lambda *given, **options: np.ones(1, bool))
     recording = todo(tmp_path, "drive", approach=(5.0, 15.0, 30.0), size=640)
-    drive = SimpleNamespace(recording=recording, trace=market, key=(0,), scene=None)
+    drive: Any = SimpleNamespace(recording=recording, trace=market, key=(0,), scene=None)
     slots, taken = range(25, 34), {0, 4}
     rounds = target_images._approaching_rounds(
         drive, "Oldmarket", slots, lambda: [k for k in range(9) if k not in taken], np.random.default_rng(0)

@@ -7,7 +7,7 @@ import torch
 
 from ssad.drivers.lane_keeping import markings
 from ssad.drivers.lane_keeping.lane import LaneFilter
-from ssad.drivers.lane_keeping.markings import TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid
 from ssad.rendering.camera.texture import to_linear
 from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, DIRT, WIDE
 from ssad.training.road_patch import (
@@ -22,7 +22,7 @@ from ssad.training.road_patch import (
     train_road_patch,
 )
 
-GRID = TopView(half_width=4.0, row_step=2.0, far=28.0, column_step=0.1)
+GRID = RoadGrid(half_width=4.0, row_step=2.0, far=28.0, column_step=0.1)
 APPROACH = RoadApproach(15.0, 0.1, 3.5, 2.0, False, 1.0)
 CLEAN = torch.full((48, 52), ASPHALT_ALBEDO)
 

@@ -43,24 +43,30 @@ def lane_position(trace: EpisodeTrace, graph: LaneGraph) -> PositionInLane:
         trace: The drive.
         graph: Its town.
     """
-    route = trace.route.astype(np.float64)
-    steps = np.diff(route, axis=0)
-    lengths = np.hypot(*steps.T)
-    is_segment = lengths > 1e-6
-    starts, steps, lengths = route[:-1][is_segment], steps[is_segment], lengths[is_segment]
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])[:-1]
-    directions = steps / lengths[:, None]
-    place = np.stack([trace.x[:, 0], trace.y[:, 0]], 1).astype(np.float64)
-    offset = place[:, None] - starts[None]
-    along = np.clip((offset * directions).sum(-1), 0.0, lengths)
-    nearest = np.hypot(*np.moveaxis(offset - along[..., None] * directions, -1, 0)).argmin(1)
-    rows = np.arange(len(place))
-    chosen = offset[rows, nearest]
-    direction = directions[nearest]
-    deviation = direction[:, 0] * chosen[:, 1] - direction[:, 1] * chosen[:, 0]
-    yaw = np.arctan2(direction[:, 1], direction[:, 0])
-    heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - yaw))
-    return PositionInLane(deviation, heading, arc[nearest] + along[rows, nearest], _widths(graph, starts)[nearest])
+    route_points = trace.route.astype(np.float64)
+    segment_steps = np.diff(route_points, axis=0)
+    segment_lengths = np.hypot(*segment_steps.T)
+    is_segment = segment_lengths > 1e-6
+    segment_starts, segment_steps = route_points[:-1][is_segment], segment_steps[is_segment]
+    segment_lengths = segment_lengths[is_segment]
+    arc_lengths = np.concatenate([[0.0], np.cumsum(segment_lengths)])[:-1]
+    directions = segment_steps / segment_lengths[:, None]
+    ego_places = np.stack([trace.x[:, 0], trace.y[:, 0]], 1).astype(np.float64)
+    start_offsets = ego_places[:, None] - segment_starts[None]
+    segment_along = np.clip((start_offsets * directions).sum(-1), 0.0, segment_lengths)
+    nearest_segment = np.hypot(*np.moveaxis(start_offsets - segment_along[..., None] * directions, -1, 0)).argmin(1)
+    step_numbers = np.arange(len(ego_places))
+    chosen_offset = start_offsets[step_numbers, nearest_segment]
+    direction = directions[nearest_segment]
+    deviation = direction[:, 0] * chosen_offset[:, 1] - direction[:, 1] * chosen_offset[:, 0]
+    route_yaw = np.arctan2(direction[:, 1], direction[:, 0])
+    heading = np.asarray(wrap_angle(trace.yaw[:, 0].astype(np.float64) - route_yaw), np.float64)
+    return PositionInLane(
+        deviation,
+        heading,
+        arc_lengths[nearest_segment] + segment_along[step_numbers, nearest_segment],
+        _widths(graph, segment_starts)[nearest_segment],
+    )
 
 
 def _widths(graph: LaneGraph, points: F64) -> F64:
@@ -70,7 +76,7 @@ def _widths(graph: LaneGraph, points: F64) -> F64:
     is_near = np.hypot(*(lane_points - points.mean(0)).T) < np.hypot(*(points - points.mean(0)).T).max() + 20.0
     lane_points, widths = lane_points[is_near], widths[is_near]
     nearest = [int(np.square(lane_points - point).sum(1).argmin()) for point in points]
-    return widths[nearest]
+    return np.asarray(widths[nearest], np.float64)
 
 
 def is_outside(position: PositionInLane, length: float, width: float) -> Bool:
@@ -120,14 +126,16 @@ def lane_metrics(
         "lane_departure": float(len(crossings) > 0),
         "departure_time": float(crossings[0]) * trace.dt if len(crossings) else float("nan"),
     }
-    errors, sure_count = [], 0
-    for time, lane in lanes:
-        step = min(round(time / trace.dt), len(position.deviation) - 1)
-        if lane is not None:
+    lane_errors, sure_count = [], 0
+    for lane_time, perceived_lane in lanes:
+        nearest_step = min(round(lane_time / trace.dt), len(position.deviation) - 1)
+        if perceived_lane is not None:
             # The middle of the lane lies as far to the right as the ego lies to the left of it.
-            errors.append(abs(lane.offset * np.cos(position.heading[step]) + position.deviation[step]))
-            sure_count += lane.confidence >= SURE
-    metrics["lane_error"] = float(np.mean(errors)) if errors else float("nan")
+            lane_errors.append(
+                abs(perceived_lane.offset * np.cos(position.heading[nearest_step]) + position.deviation[nearest_step])
+            )
+            sure_count += perceived_lane.confidence >= SURE
+    metrics["lane_error"] = float(np.mean(lane_errors)) if lane_errors else float("nan")
     metrics["lane_seen"] = sure_count / max(len(lanes), 1)
     return metrics
 

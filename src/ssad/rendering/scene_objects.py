@@ -355,7 +355,6 @@ def place_objects(
     free_ground = GroundOccupancy(street)
     _add_parked_vehicles(
         population,
-        graph,
         street,
         route_points,
         free_ground,
@@ -432,15 +431,14 @@ def _fixed_track(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
     return np.array([[x, y, yaw, z]])
 
 
-def _add_parked_vehicles(  # noqa: PLR0917
+def _add_parked_vehicles(
     population: SceneObjects,
-    graph: LaneGraph,
     street: Street,
     route_points: F64,
     clear: GroundOccupancy,
     shares: Mapping[str, float],
 ) -> None:
-    """Vehicles parked at the kerb and on parking places; building sites of cones and barriers round machines."""
+    """Vehicles parked in bays and on parking places; building sites of cones and barriers round machines."""
     rng = generator("record kerb", *population.key)
     occupancy = float(rng.uniform(0.25, 0.75))
     kinds, weights = list(shares), np.array(list(shares.values()))

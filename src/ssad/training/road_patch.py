@@ -23,7 +23,7 @@ from torch.nn import functional
 from ssad.core.seeding import generator
 from ssad.drivers.lane_keeping.control import PREVIEW
 from ssad.drivers.lane_keeping.lane import CHANGE, FITS, FULL_WEIGHT, INITIAL, NOISE, NOISE_STEP, STEP
-from ssad.drivers.lane_keeping.markings import CONTRAST, FULL_CONTRAST, SIDE, TopView
+from ssad.drivers.lane_keeping.markings import CONTRAST, FULL_CONTRAST, SIDE, RoadGrid
 from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, CELL, DIRT, LENGTH, WIDE
 from ssad.scenarios.static.physical.textures.card import TextureCard, save_texture
 
@@ -33,7 +33,7 @@ DASH, PERIOD = 3.0, 9.0  # m
 EXPOSURE = 0.78  # code value over albedo, both linear
 FOOTPRINT = 1.0 / 764.0  # 1/m: a pixel row covers so much times the square of the distance, m
 ENOUGH = 2.5  # m
-COARSE = TopView(half_width=4.0, row_step=1.0)
+COARSE = RoadGrid(half_width=4.0, row_step=1.0)
 LANE_WIDTH = 3.5  # m
 LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
 
@@ -80,7 +80,7 @@ def draw_approaches(count: int, *, key: tuple[object, ...]) -> list[RoadApproach
     ]
 
 
-def road_brightness(patch: Tensor, grid: TopView, approach: RoadApproach, pose: Tensor) -> Tensor:
+def road_brightness(patch: Tensor, grid: RoadGrid, approach: RoadApproach, pose: Tensor) -> Tensor:
     """Return the brightness of the road as the lane keeper sees it from above, code values [R, C].
 
     Args:
@@ -122,7 +122,7 @@ def road_brightness(patch: Tensor, grid: TopView, approach: RoadApproach, pose: 
     return 255.0 * to_srgb((albedo_sum / len(footprint_shares) * EXPOSURE * approach.gain).clamp(1e-4, 1.0))
 
 
-def marking_strength(brightness: Tensor, grid: TopView) -> Tensor:
+def marking_strength(brightness: Tensor, grid: RoadGrid) -> Tensor:
     """Return `ssad.drivers.lane_keeping.markings.marking_strength`, differentiable."""
     shift = max(1, round(SIDE / grid.column_step))
     inner = brightness[:, shift:-shift]
@@ -141,7 +141,7 @@ class LaneModel:
         offset: Place of its middle at the start, m to the left of the ego.
     """
 
-    def __init__(self, grid: TopView, *, width: float, offset: float = 0.0) -> None:
+    def __init__(self, grid: RoadGrid, *, width: float, offset: float = 0.0) -> None:
         self.grid = grid
         self.state = torch.tensor([offset, 0.0, 0.0, width], dtype=torch.float32)
         self.covariance = torch.diag(torch.tensor(INITIAL).square())
@@ -188,7 +188,7 @@ class LaneModel:
         self.covariance = 0.5 * (covariance + covariance.T)
 
 
-def deviation(patch: Tensor, approach: RoadApproach, grid: TopView, *, seconds: float = 2.5) -> Tensor:
+def deviation(patch: Tensor, approach: RoadApproach, grid: RoadGrid, *, seconds: float = 2.5) -> Tensor:
     """Return the place of the ego beside the middle of its lane at each step of a drive over the patch [T], m.
 
     Args:
@@ -248,7 +248,7 @@ def train_road_patch(
     side: float = 1.0,
     seed: int = 0,
     report: bool = False,
-    grid: TopView = COARSE,
+    grid: RoadGrid = COARSE,
 ) -> tuple[Tensor, list[float]]:
     """Return the albedo [H, W] of a patch that leads the lane keeper out of its lane, and the deviations, m.
 

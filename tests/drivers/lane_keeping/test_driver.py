@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import U8, EpisodeLimits
 from ssad.drivers.lane_keeping.driver import CHANNEL, LaneKeeper
-from ssad.drivers.lane_keeping.markings import RoadMap, TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid, RoadMap
 from ssad.drivers.perceiving.driver import LaneEvent
 from ssad.drivers.perceiving.planner import AutopilotPlanner
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
@@ -21,7 +21,7 @@ from ssad.metrics.lane_keeping import lane_metrics, lane_position
 from ssad.world.rollout import rollout
 
 CAMERA = Camera.typical(320, 192, channel=CHANNEL)
-GRID = TopView(row_step=0.5, column_step=0.1)
+GRID = RoadGrid(row_step=0.5, column_step=0.1)
 
 
 class DrawnRoad:

@@ -7,9 +7,9 @@ import pytest
 
 from ssad.core.types import F32
 from ssad.drivers.lane_keeping.lane import LaneFilter, line_places, search_lane
-from ssad.drivers.lane_keeping.markings import TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid
 
-GRID = TopView(row_step=0.5)
+GRID = RoadGrid(row_step=0.5)
 
 
 def drawn(offset: float, heading: float, curvature: float, width: float, *, gaps: bool = False) -> F32:

@@ -7,10 +7,10 @@ import pytest
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.drivers.lane_keeping.markings import FULL_CONTRAST, RoadMap, TopView, marking_strength
+from ssad.drivers.lane_keeping.markings import FULL_CONTRAST, RoadGrid, RoadMap, marking_strength
 from ssad.rendering.camera.rig import rig_camera
 
-GRID = TopView()
+GRID = RoadGrid()
 
 
 def test_the_grid_has_the_stated_extent() -> None:
@@ -19,7 +19,7 @@ def test_the_grid_has_the_stated_extent() -> None:
     assert GRID.lateral[0] == pytest.approx(8.0)
     assert GRID.lateral[-1] == pytest.approx(-8.0)
     with pytest.raises(ConfigError, match="0 < near < far"):
-        TopView(near=40.0)
+        RoadGrid(near=40.0)
 
 
 def test_a_place_on_the_road_is_the_pixel_where_the_camera_shows_it() -> None:

@@ -158,7 +158,7 @@ def test_regions_have_no_cracks() -> None:
 def test_arrays_tiles_and_levels(name: str) -> None:
     scene = street(name)
     scene.check()
-    assert 100_000 <= len(scene.faces) <= 330_000
+    assert 100_000 <= len(scene.faces) <= 600_000
     assert np.abs(np.linalg.norm(scene.normals, axis=-1) - 1.0).max() < 1e-4
     sizes = [np.diff(scene.offset[k, [0, -1]])[0] for k in range(3)]
     assert sizes[0] > 1.5 * sizes[1] > 2.5 * sizes[2]
@@ -200,6 +200,35 @@ def test_signals_and_lamps(name: str) -> None:
     assert (scene.lamps[:, 2] > 3.0).all()
     area = ground(name)
     assert area.at(area.paved, scene.parking[:, :2]).min(initial=9.0) > 1.5
+
+
+def test_bays_lie_between_the_lanes_and_a_walkway() -> None:
+    """Nothing stands in a bay, it keeps off the lanes, and a strip of pavement is left beside it."""
+    graph, scene, area = town("Twinford"), street("Twinford"), ground("Twinford")
+    assert len(scene.bays) > 50
+    assert not len(street("Oldmarket").bays), "its pavements are too narrow"
+    upright = scene.vertices[(scene.vertices[:, 2] > 0.35) & (scene.vertices[:, 2] < 2.4)][:, :2].astype(np.float64)
+    for x, y, yaw, depth, room in scene.bays.astype(np.float64).tolist():
+        along, right = np.array([np.cos(yaw), np.sin(yaw)]), np.array([np.sin(yaw), -np.cos(yaw)])
+        corners = np.array([[x, y] + s * along + d * right for s in (-3.0, 3.0) for d in (0.1, depth)])
+        assert from_lanes(graph, corners).min() > -0.05
+        walkway = np.array([[x, y] + (depth + 0.45) * right])
+        assert area.at(area.walk, walkway)[0] < 0.0
+        local = (upright - [x, y]) @ np.stack([along, right], axis=1)
+        assert not ((np.abs(local[:, 0]) < 2.5) & (local[:, 1] > 0.2) & (local[:, 1] < depth - 0.5)).any()
+        assert room >= 3.2
+
+
+def test_foliage_is_small_and_no_street_is_one_green_to_the_horizon() -> None:
+    scene = street("Twinford")
+    leaf = of(scene, ("leaves_round", "leaves_tall", "leaves_birch"))
+    near = leaf & np.isin(np.arange(len(scene.faces)), scene.order[scene.offset[0, 0] : scene.offset[0, -1]])
+    p = corners(scene)[near]
+    longest = np.linalg.norm(p - np.roll(p, 1, axis=1), axis=-1).max(axis=1)
+    assert np.median(longest) < 0.8
+    names = [material.name for material in scene.materials]
+    horizon = {names[row] for row in scene.material[scene.tile_faces(scene.nx * scene.ny)]}
+    assert {"field_crop", "field_stubble", "tree_line"} <= horizon
 
 
 def test_buildings_face_outwards() -> None:

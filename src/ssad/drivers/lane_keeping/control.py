@@ -67,24 +67,30 @@ def following_acceleration(view: Observation, belief: Belief, row: int, lane: Pe
         inf where nothing is in the lane.
     """
     is_object = belief.kind[row] != AgentKind.NONE
-    pose = belief.pose[row][is_object].astype(np.float64)
-    x, y, yaw = view.pose[row].astype(np.float64).tolist()
-    offset = pose[:, :2] - [x, y]
-    ahead = offset[:, 0] * np.cos(yaw) + offset[:, 1] * np.sin(yaw)
-    lateral = offset[:, 1] * np.cos(yaw) - offset[:, 0] * np.sin(yaw)
-    length, width = belief.size[row][is_object].astype(np.float64).T
-    turn = pose[:, 2] - yaw
-    half_length = 0.5 * (length * np.abs(np.cos(turn)) + width * np.abs(np.sin(turn)))
-    half_width = 0.5 * (length * np.abs(np.sin(turn)) + width * np.abs(np.cos(turn)))
-    middle = lane.offset + lane.heading * ahead + 0.5 * lane.curvature * ahead**2
-    in_path = (ahead > 0.0) & (ahead < REACH) & (np.abs(lateral - middle) < half_width + 0.5 * size[1] + PATH)
-    if not in_path.any():
+    object_poses = belief.pose[row][is_object].astype(np.float64)
+    ego_x, ego_y, ego_yaw = view.pose[row].astype(np.float64).tolist()
+    offset = object_poses[:, :2] - [ego_x, ego_y]
+    distance_ahead = offset[:, 0] * np.cos(ego_yaw) + offset[:, 1] * np.sin(ego_yaw)
+    lateral_offset = offset[:, 1] * np.cos(ego_yaw) - offset[:, 0] * np.sin(ego_yaw)
+    object_length, object_width = belief.size[row][is_object].astype(np.float64).T
+    relative_yaw = object_poses[:, 2] - ego_yaw
+    half_length = 0.5 * (object_length * np.abs(np.cos(relative_yaw)) + object_width * np.abs(np.sin(relative_yaw)))
+    half_width = 0.5 * (object_length * np.abs(np.sin(relative_yaw)) + object_width * np.abs(np.cos(relative_yaw)))
+    lane_middle = lane.offset + lane.heading * distance_ahead + 0.5 * lane.curvature * distance_ahead**2
+    reach_aside = half_width + 0.5 * size[1] + PATH
+    is_in_path = (distance_ahead > 0.0) & (distance_ahead < REACH)
+    is_in_path &= np.abs(lateral_offset - lane_middle) < reach_aside
+    if not is_in_path.any():
         return float("inf")
-    gap = np.maximum((ahead - half_length)[in_path] - 0.5 * size[0], 0.1)
-    speed = float(view.speed[row])
-    closing = speed - belief.speed[row][is_object].astype(np.float64)[in_path] * np.cos(turn[in_path])
-    desired = STANDSTILL + np.maximum(speed * HEADWAY + speed * closing / (2.0 * np.sqrt(PULL * COMFORT)), 0.0)
-    return float((PULL * (1.0 - (desired / gap) ** 2)).min())
+    free_gap = np.maximum((distance_ahead - half_length)[is_in_path] - 0.5 * size[0], 0.1)
+    ego_speed = float(view.speed[row])
+    closing_speed = ego_speed - belief.speed[row][is_object].astype(np.float64)[is_in_path] * np.cos(
+        relative_yaw[is_in_path]
+    )
+    desired_gap = STANDSTILL + np.maximum(
+        ego_speed * HEADWAY + ego_speed * closing_speed / (2.0 * np.sqrt(PULL * COMFORT)), 0.0
+    )
+    return float((PULL * (1.0 - (desired_gap / free_gap) ** 2)).min())
 
 
 def line_acceleration(view: Observation, row: int, half_length: float) -> float:

@@ -33,7 +33,7 @@ from ssad.drivers.lane_keeping.control import (
     steer_for,
 )
 from ssad.drivers.lane_keeping.lane import SURE, LaneFilter
-from ssad.drivers.lane_keeping.markings import RoadMap, TopView, marking_strength
+from ssad.drivers.lane_keeping.markings import RoadGrid, RoadMap, marking_strength
 from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
 from ssad.drivers.perceiving.parts import Perceiver, make_perceiver, part_version
 from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_cameras
@@ -46,7 +46,7 @@ PATIENCE: Final = 1.5  # s without markings before it slows down
 class _Scene:
     """Memory of one episode."""
 
-    def __init__(self, grid: TopView, size: F64, power: F64, wheel: F64) -> None:
+    def __init__(self, grid: RoadGrid, size: F64, power: F64, wheel: F64) -> None:
         self.filter = LaneFilter(grid)
         self.size, self.power, self.wheel = size, power, wheel
         self.pose: F64 | None = None
@@ -76,7 +76,7 @@ class LaneKeeper(PerceivingDriver):
         perceiver: Perceiver | str | None = None,
         *,
         camera: Camera | None = None,
-        grid: TopView | None = None,
+        grid: RoadGrid | None = None,
         **settings: Any,
     ) -> None:
         if settings.get("planner") is not None:
@@ -86,7 +86,7 @@ class LaneKeeper(PerceivingDriver):
         self.controller = Controller.EXTERNAL
         self.__dict__.pop("believe", None)  # the Autopilot does not plan for it
         self.lane_camera = camera or nuscenes_cameras()[CHANNEL]
-        self.road_map = RoadMap(self.lane_camera, grid or TopView())
+        self.road_map = RoadMap(self.lane_camera, grid or RoadGrid())
         self.sensors = tuple(dict.fromkeys((*self.sensors, CHANNEL)))
         self._scenes: list[_Scene] = []
 

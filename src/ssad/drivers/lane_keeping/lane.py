@@ -14,7 +14,7 @@ import numpy as np
 
 from ssad.core.perception import PerceivedLane
 from ssad.core.types import F32, F64
-from ssad.drivers.lane_keeping.markings import TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid
 
 # reach, m, and half width, m, around the predicted line, of the fits one after the other: each extends the one before
 FITS: Final = ((14.0, 0.7), (20.0, 0.6), (28.0, 0.5), (np.inf, 0.4))
@@ -43,7 +43,7 @@ class LaneFilter:
         grid: Top view that markings are given in.
     """
 
-    def __init__(self, grid: TopView) -> None:
+    def __init__(self, grid: RoadGrid) -> None:
         self.grid = grid
         self.state: F64 | None = None
         self.covariance: F64 = np.diag(np.square(INITIAL))
@@ -76,7 +76,7 @@ class LaneFilter:
 
     def held(self) -> PerceivedLane | None:
         """Return the predicted lane, without confidence; None as long as none was found."""
-        return None if self.state is None else PerceivedLane(*self.state.tolist(), 0.0)
+        return None if self.state is None else _lane_of(self.state, 0.0)
 
     def correct(self, strength: F32) -> PerceivedLane | None:
         """Correct the lane with the markings of an image.
@@ -115,10 +115,16 @@ class LaneFilter:
             self.state = prior
         else:
             self.covariance = 0.5 * (covariance + covariance.T)
-        return PerceivedLane(*self.state.tolist(), confidence)
+        return _lane_of(self.state, confidence)
 
 
-def line_places(strength: F32, grid: TopView, line: F64, window: float) -> tuple[F64, F64]:
+def _lane_of(state: F64, confidence: float) -> PerceivedLane:
+    """Return the lane of a state [4]."""
+    offset, heading, curvature, width = state.tolist()
+    return PerceivedLane(offset, heading, curvature, width, confidence)
+
+
+def line_places(strength: F32, grid: RoadGrid, line: F64, window: float) -> tuple[F64, F64]:
     """Return the mean place of the markings near a line in each row, and their weight.
 
     Args:
@@ -138,7 +144,7 @@ def line_places(strength: F32, grid: TopView, line: F64, window: float) -> tuple
     return place, (total * grid.column_step / 0.1).clip(0.0, 1.0)
 
 
-def search_lane(strength: F32, grid: TopView) -> F64 | None:
+def search_lane(strength: F32, grid: RoadGrid) -> F64 | None:
     """Return the lane [4] of offset, heading, curvature and width with the clearest lines; None: there is none.
 
     Both lines must be there, and a lane near the middle of the ego counts more than a neighbouring one.

@@ -25,7 +25,7 @@ DARKEST: Final = 4.0  # code values: darker rows show nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TopView:
+class RoadGrid:
     """Grid on the road in the frame of the ego, in front of it.
 
     Attributes:
@@ -68,7 +68,7 @@ class RoadMap:
     """
 
     camera: Camera
-    grid: TopView
+    grid: RoadGrid
 
     @cached_property
     def pixels(self) -> tuple[F32, F32]:
@@ -106,7 +106,7 @@ class RoadMap:
         return np.where(columns < 0.0, np.float32(np.nan), seen)
 
 
-def marking_strength(brightness: F32, grid: TopView) -> F32:
+def marking_strength(brightness: F32, grid: RoadGrid) -> F32:
     """Return how clearly each place shows a marking, [R, C] in 0 to 1.
 
     Args:

@@ -20,7 +20,7 @@ from ssad.core.images import save_picture
 from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.core.traces import first_difference, load_trace
-from ssad.drivers.lane_keeping.markings import TopView
+from ssad.drivers.lane_keeping.markings import RoadGrid
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
 from ssad.experiments.gap import page
@@ -53,7 +53,7 @@ from ssad.scenarios.static.perturbation import EGO, Perturbation
 from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
 from ssad.simulators.closed_loop import build_requested_episode, cached_town, system_version
 
-VIEW_AHEAD = TopView().far  # m: range of the lane keeper
+VIEW_AHEAD = RoadGrid().far  # m: range of the lane keeper
 FRAME_INTERVAL = 0.2  # s from one frame of a film to the next
 
 

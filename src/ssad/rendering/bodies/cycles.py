@@ -70,6 +70,7 @@ FRAME_COVER = (
     (-0.05, 0.13, 0.48, 0.82),
     (0.32, 0.07, 0.62, 0.86),
 )
+DARK_RIM = Material("rim", (0.09, 0.09, 0.095), specular=0.2, gloss=0.6)
 ENGINE_BLOCK = Material("engine", (0.045, 0.045, 0.048), specular=0.12, gloss=0.5)
 FAIRING = ((0.12, 0.24, 0.38, 0.80), (0.45, 0.22, 0.46, 1.00), (0.72, 0.13, 0.76, 1.02), (0.80, 0.05, 0.82, 0.96))
 
@@ -264,7 +265,7 @@ def _tyres(axles: Sequence[tuple[float, float]], radius: float, detail: int) -> 
         parts.append(tyre.moved(x, 0.0, radius))
         if detail:
             # Each half keeps to its side: the inner end of one would hide the spokes of the other.
-            rim_disc = wheel(0.80 * radius, 0.04, detail=detail, rim=0.94, spokes=5)
+            rim_disc = wheel(0.80 * radius, 0.04, detail=detail, rim=0.94, spokes=5, steel=DARK_RIM)
             parts.append(both_sides(rim_disc.moved(y=0.022)).moved(x, 0.0, radius))
     return parts
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import LaneType
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.free_ground import FreeGround, footprint
@@ -19,6 +20,7 @@ SPACING = 6.5  # m between places
 END = 9.0  # m from the ends of a street without a bay
 WALKWAY = 0.9  # m of pavement left beside a bay
 LEAST_DEPTH, MAX_DEPTH = 2.0, 2.7  # m
+MAX_TURN = 0.1  # rad along a place: bays are straight
 STEP = 0.5  # m between the stations at which the ground is tested
 LINE = 0.1  # m, width of the outline
 FRONT = 0.12  # m between the border of the road and a bay
@@ -57,11 +59,15 @@ def _pose(graph: LaneGraph, lane: int, station: float) -> tuple[float, float, fl
 
 
 def _free_runs(ground: FreeGround, lane: int, depth: float) -> list[tuple[float, float]]:
-    """Return the stretches of a shoulder, at least as long as a place, on which nothing stands."""
+    """Return the stretches of a shoulder, at least as long as a place, that are straight and free."""
     graph = ground.graph
     stations = np.arange(END, float(graph.length[lane]) - END, STEP)
     is_free = np.zeros(len(stations) + 1, bool)
     for index, station in enumerate(stations.tolist()):
+        _, _, yaw_before = _pose(graph, lane, station - 0.5 * SPACING)
+        _, _, yaw_after = _pose(graph, lane, station + 0.5 * SPACING)
+        if abs(wrap_scalar(yaw_after - yaw_before)) > MAX_TURN:
+            continue
         points = footprint(_pose(graph, lane, station), (-0.5 * STEP, 0.5 * STEP), (-depth, -0.1))
         is_free[index] = not ground.is_occupied(points) and bool((ground.crosswalk_distance(points) > CROSSING).all())
     edges = np.flatnonzero(np.diff(is_free.astype(int), prepend=0)).reshape(-1, 2)

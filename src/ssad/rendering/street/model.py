@@ -5,7 +5,7 @@ Shape letters: V vertices, F faces, M masts, H signal heads. World frame, metres
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ FORMAT = 2  # of the .npz file
 TILE = 32.0  # m
 LEVELS = 3
 NEAR, MID, FAR = 1, 2, 4  # bits of the levels at which a face is drawn
-REACH = (70.0, 180.0)  # m from the eye up to which tiles are drawn at level 0 and 1
+REACH = (64.0, 180.0)  # m from the eye up to which tiles are drawn at level 0 and 1
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ class Street:
     head_signal: I32
     head_lens: I32
     parking: F32
-    bays: F32
+    bays: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
 
     def __post_init__(self) -> None:
         # Streets are cached and shared between scenes, so their arrays must not change.
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for entry in fields(self):
+            value = getattr(self, entry.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 

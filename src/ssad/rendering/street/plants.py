@@ -100,17 +100,17 @@ def leaves(
     directions = np.stack([circle_radii * np.cos(azimuths), circle_radii * np.sin(azimuths), z], axis=1)
     # Leaves of one branch stand out together: the outline is uneven at the scale of branches, too.
     branch = np.sin(directions @ rng.normal(0.0, 3.4, 3) + rng.uniform(0.0, 6.0))
-    depth = 0.94 + 0.09 * branch + rng.uniform(-0.16, 0.10, count)
+    depth = 0.93 + 0.05 * branch + rng.uniform(-0.10, 0.07, count)
     centres = directions * radius * depth[:, None] + centre
     leaf_normals = directions + 0.8 * rng.normal(size=(count, 3))
     leaf_normals /= np.linalg.norm(leaf_normals, axis=1, keepdims=True)
     leaf_normals *= np.sign((leaf_normals * directions).sum(axis=1, keepdims=True) + 1e-9)
     side_axes = cross(leaf_normals, rng.normal(size=(count, 3)))
     half_sizes = 0.5 * size * rng.uniform(0.7, 1.25, (count, 1, 1))
-    vertex_normals = directions / radius * float(np.mean(radius)) + 0.35 * leaf_normals + [0.0, 0.0, 0.15]
+    vertex_normals = directions / radius * float(np.mean(radius)) + 0.9 * leaf_normals + [0.0, 0.0, 0.2]
     # The upper and outer leaves catch more light: lighter greens come first in the table.
-    shade = 0.5 * (1.0 - z) + 1.6 * (0.97 - depth)
-    material_index = np.clip((shade * len(materials) + rng.normal(0.0, 0.7, count)).astype(int), 0, len(materials) - 1)
+    shade = 0.35 * (1.0 - z) + 1.5 * (0.97 - depth)
+    material_index = np.clip((shade * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1)
     return _leaf_cards(
         centres, leaf_normals, side_axes, half_sizes, vertex_normals, np.array(materials)[material_index], levels=levels
     )
@@ -160,22 +160,22 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
         blob(centre, 0.98 * radius, greens[1], materials, levels=FAR, rough=0.1),
     ]
     lobe_count = {"round": 3, "tall": 2, "birch": 3}[kind]
-    leaf_count = {"round": 60, "tall": 68, "birch": 50}[kind]
+    leaf_count = {"round": 88, "tall": 94, "birch": 76}[kind]
     for lobe_index in range(lobe_count):
         angle = 2.0 * np.pi * lobe_index / lobe_count + rng.uniform(-0.5, 0.5)
         height_offset = (lobe_index / max(lobe_count - 1, 1) - 0.5) * 0.7
         lobe_offset = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), height_offset]) * radius
         lobe_radius = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
         parts += [
-            blob(centre + lobe_offset, 0.76 * lobe_radius, dark_green, materials, levels=NEAR),
+            blob(centre + lobe_offset, 0.86 * lobe_radius, dark_green, materials, levels=NEAR),
             blob(centre + lobe_offset, 0.9 * lobe_radius, greens[-1], materials, levels=MID, rough=0.2),
             leaves(
                 centre + lobe_offset,
                 lobe_radius,
                 materials,
                 count=leaf_count,
-                size=0.33 * float(lobe_radius.mean()),
-                materials=[*greens, dark_green],
+                size=0.46 * float(lobe_radius.mean()),
+                materials=[materials.palette.shade(greens[0], 1.35), *greens],
             ),
             leaves(
                 centre + lobe_offset,
@@ -269,7 +269,7 @@ def bush(materials: TownMaterials) -> TrianglePiece:
         [
             blob(centre, 0.8 * radius, materials.palette.shade(greens[-1], 0.7), materials, levels=NEAR),
             blob(centre, 0.94 * radius, greens[-1], materials, levels=MID, rough=0.2),
-            leaves(centre, radius, materials, count=44, size=0.3, materials=greens),
+            leaves(centre, radius, materials, count=50, size=0.36, materials=greens),
         ]
     )
 

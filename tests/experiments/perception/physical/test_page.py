@@ -20,17 +20,16 @@ from ssad.experiments.perception.physical.approach_page import (
     detection_table,
 )
 from ssad.experiments.perception.physical.page import (
-    PhysicalRun,
     comparison_table,
     grid_table,
     main_table,
     maps,
     margin_table,
-    score,
     summary,
     tiles,
     transfer_table,
 )
+from ssad.experiments.perception.physical.physical_run import PhysicalRun, score
 from ssad.experiments.runs import write_report
 from ssad.metrics.target_approach import stopping_distance
 from ssad.report.figures import HeatMap, heat_maps

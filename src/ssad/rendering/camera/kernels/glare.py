@@ -28,7 +28,7 @@ def shrink(
     out: wp.array3d(dtype=wp.vec3),
 ):
     """Halve images. Weights [size, 4] are those of the rows 2 i - 1 to 2 i + 2, 0 outside of the image."""
-    view, half_row = wp.tid()
+    view_index, half_row = wp.tid()
     height = image.shape[1]
     width = image.shape[2]
     for half_column in range(out.shape[2]):
@@ -38,27 +38,27 @@ def shrink(
         middle = wp.min(2 * half_column + 1, width - 1)
         for tap in range(4):
             y = wp.clamp(2 * half_row - 1 + tap, 0, height - 1)
-            row = (
-                image[view, y, left] * column_weights[half_column, 0]
-                + image[view, y, 2 * half_column] * column_weights[half_column, 1]
+            row_index = (
+                image[view_index, y, left] * column_weights[half_column, 0]
+                + image[view_index, y, 2 * half_column] * column_weights[half_column, 1]
             )
-            row += (
-                image[view, y, middle] * column_weights[half_column, 2]
-                + image[view, y, right] * column_weights[half_column, 3]
+            row_index += (
+                image[view_index, y, middle] * column_weights[half_column, 2]
+                + image[view_index, y, right] * column_weights[half_column, 3]
             )
-            total += row * row_weights[half_row, tap]
-        out[view, half_row, half_column] = total
+            total += row_index * row_weights[half_row, tap]
+        out[view_index, half_row, half_column] = total
 
 
 @wp.func
-def enlarged(image: wp.array3d(dtype=wp.vec3), view: int, y: int, x: int) -> wp.vec3:
+def enlarged(image: wp.array3d(dtype=wp.vec3), view_index: int, y: int, x: int) -> wp.vec3:
     """Return a pixel of an image of twice the size, interpolated between four."""
-    row = y / 2
+    row_index = y / 2
     column = x / 2
-    other_row = wp.clamp(row - 1 + 2 * (y - 2 * row), 0, image.shape[1] - 1)
+    other_row = wp.clamp(row_index - 1 + 2 * (y - 2 * row_index), 0, image.shape[1] - 1)
     other_column = wp.clamp(column - 1 + 2 * (x - 2 * column), 0, image.shape[2] - 1)
-    upper = image[view, row, column] * 0.75 + image[view, row, other_column] * 0.25
-    lower = image[view, other_row, column] * 0.75 + image[view, other_row, other_column] * 0.25
+    upper = image[view_index, row_index, column] * 0.75 + image[view_index, row_index, other_column] * 0.25
+    lower = image[view_index, other_row, column] * 0.75 + image[view_index, other_row, other_column] * 0.25
     return upper * 0.75 + lower * 0.25
 
 
@@ -71,21 +71,21 @@ def gather(
     out: wp.array3d(dtype=wp.vec3),
 ):
     """Add a level of the pyramid times its weight [B] to the sum of the coarser ones (0: there is none)."""
-    view, y = wp.tid()
-    weight = weights[view]
+    view_index, y = wp.tid()
+    weight = weights[view_index]
     for x in range(out.shape[2]):
-        total = level[view, y, x] * weight
+        total = level[view_index, y, x] * weight
         if coarser_share > 0.0:
-            total += enlarged(coarser, view, y, x)
-        out[view, y, x] = total
+            total += enlarged(coarser, view_index, y, x)
+        out[view_index, y, x] = total
 
 
 @wp.func
-def texel(image: wp.array3d(dtype=wp.vec3), view: int, y: int, x: int) -> wp.vec3:
+def texel(image: wp.array3d(dtype=wp.vec3), view_index: int, y: int, x: int) -> wp.vec3:
     """Return a pixel of an image, black outside."""
     if y < 0 or x < 0 or y >= image.shape[1] or x >= image.shape[2]:
         return wp.vec3(0.0, 0.0, 0.0)
-    return image[view, y, x]
+    return image[view_index, y, x]
 
 
 @wp.kernel
@@ -102,25 +102,25 @@ def add_ghosts(
     centres: principal points, px from the corner of the image; scale, source_scale: px of the image along a pixel of
     the level and of the source.
     """
-    view, y = wp.tid()
-    centre = centres[view]
+    view_index, y = wp.tid()
+    centre = centres[view_index]
     for x in range(out.shape[2]):
-        total = out[view, y, x]
+        total = out[view_index, y, x]
         for index in range(GHOSTS):
-            ghost = ghosts[view, index]
+            ghost = ghosts[view_index, index]
             if ghost.light[1] > 0.0:
                 source_x = (((float(x) + 0.5) * scale - centre[0]) / ghost.size + centre[0]) / source_scale - 0.5
                 source_y = (((float(y) + 0.5) * scale - centre[1]) / ghost.size + centre[1]) / source_scale - 0.5
                 column = int(wp.floor(source_x))
-                row = int(wp.floor(source_y))
+                row_index = int(wp.floor(source_y))
                 right_share = source_x - float(column)
-                lower_share = source_y - float(row)
-                upper = texel(source, view, row, column) * (1.0 - right_share)
-                upper += texel(source, view, row, column + 1) * right_share
-                lower = texel(source, view, row + 1, column) * (1.0 - right_share)
-                lower += texel(source, view, row + 1, column + 1) * right_share
+                lower_share = source_y - float(row_index)
+                upper = texel(source, view_index, row_index, column) * (1.0 - right_share)
+                upper += texel(source, view_index, row_index, column + 1) * right_share
+                lower = texel(source, view_index, row_index + 1, column) * (1.0 - right_share)
+                lower += texel(source, view_index, row_index + 1, column + 1) * right_share
                 total += wp.cw_mul(upper * (1.0 - lower_share) + lower * lower_share, ghost.light)
-        out[view, y, x] = total
+        out[view_index, y, x] = total
 
 
 @wp.kernel
@@ -134,13 +134,13 @@ def mix(
 
     scattered has half the size. A view whose direct share is 1 is copied.
     """
-    view, y = wp.tid()
-    share = direct[view]
+    view_index, y = wp.tid()
+    share = direct[view_index]
     for x in range(out.shape[2]):
         if share < 1.0:
-            out[view, y, x] = radiance[view, y, x] * share + enlarged(scattered, view, y, x)
+            out[view_index, y, x] = radiance[view_index, y, x] * share + enlarged(scattered, view_index, y, x)
         else:
-            out[view, y, x] = radiance[view, y, x]
+            out[view_index, y, x] = radiance[view_index, y, x]
 
 
 @wp.kernel
@@ -152,25 +152,27 @@ def take_lamps(
     out: wp.array3d(dtype=wp.vec3),
 ):
     """Compute the light that lamps have beyond that of the image; gains: see `lamp_gains`; lamps [B]: 0 by day."""
-    view, row = wp.tid()
+    view_index, row_index = wp.tid()
     for column in range(out.shape[2]):
         source = wp.vec3(0.0, 0.0, 0.0)
-        index = material[view, row, column]
-        if lamps[view] > 0.0 and index >= 0:
+        index = material[view_index, row_index, column]
+        if lamps[view_index] > 0.0 and index >= 0:
             if gains[index, 0] > 0.0:
-                light = radiance[view, row, column]
-                if 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2] > gains[index, 1] * lamps[view]:
-                    source = light * (gains[index, 0] * lamps[view])
-        out[view, row, column] = source
+                light = radiance[view_index, row_index, column]
+                if 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2] > gains[index, 1] * lamps[view_index]:
+                    source = light * (gains[index, 0] * lamps[view_index])
+        out[view_index, row_index, column] = source
 
 
 @wp.kernel
 def add_enlarged(scattered: wp.array3d(dtype=wp.vec3), lamps: wp.array(dtype=float), out: wp.array3d(dtype=wp.vec3)):
     """Add light of half the size to the views in which lamps are on."""
-    view, row = wp.tid()
-    if lamps[view] > 0.0:
+    view_index, row_index = wp.tid()
+    if lamps[view_index] > 0.0:
         for column in range(out.shape[2]):
-            out[view, row, column] = out[view, row, column] + enlarged(scattered, view, row, column)
+            out[view_index, row_index, column] = out[view_index, row_index, column] + enlarged(
+                scattered, view_index, row_index, column
+            )
 
 
 @wp.struct
@@ -193,15 +195,15 @@ class SunDisc:
 @wp.kernel
 def add_sun(discs: wp.array(dtype=SunDisc), tag: wp.array3d(dtype=int), side: int, radiance: wp.array3d(dtype=wp.vec3)):
     """Add the disc of the sun to the sky of images: 4 x 4 samples a pixel, in squares of `side` px."""
-    view, row, column = wp.tid()
-    disc = discs[view]
+    view_index, row_index, column = wp.tid()
+    disc = discs[view_index]
     if disc.light[0] <= 0.0:
         return
-    image_row = int(wp.floor(disc.y)) - side / 2 + row
+    image_row = int(wp.floor(disc.y)) - side / 2 + row_index
     image_column = int(wp.floor(disc.x)) - side / 2 + column
     if image_row < 0 or image_column < 0 or image_row >= radiance.shape[1] or image_column >= radiance.shape[2]:
         return
-    if tag[view, image_row, image_column] >= 0:
+    if tag[view_index, image_row, image_column] >= 0:
         return
     inside = int(0)
     for sample in range(16):
@@ -210,6 +212,6 @@ def add_sun(discs: wp.array(dtype=SunDisc), tag: wp.array3d(dtype=int), side: in
         if dx * dx + dy * dy < disc.radius * disc.radius:
             inside += 1
     if inside > 0:
-        radiance[view, image_row, image_column] = radiance[view, image_row, image_column] + disc.light * (
+        radiance[view_index, image_row, image_column] = radiance[view_index, image_row, image_column] + disc.light * (
             float(inside) / 16.0
         )

@@ -31,15 +31,17 @@ class SunMap:
 
 
 @wp.func
-def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
+def open_texel(
+    shadows: wp.array3d(dtype=wp.uint64), view_index: int, row_index: int, column: int, depth: float
+) -> float:
     """Return 1 if the texel holds nothing nearer to the light, else 0."""
-    if wp.cast(wp.uint32(shadows[view, row, column] >> wp.uint64(32)), float) <= depth:
+    if wp.cast(wp.uint32(shadows[view_index, row_index, column] >> wp.uint64(32)), float) <= depth:
         return 1.0
     return 0.0
 
 
 @wp.func
-def sun_share(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
+def sun_share(shadows: wp.array3d(dtype=wp.uint64), view_index: int, p: wp.vec3, bias: float) -> float:
     """Return the share of the sun that reaches a point, from four weighted texels of a shadow map.
 
     p: the point in texels, and in metres along the light. Points outside the map give -1.
@@ -56,21 +58,24 @@ def sun_share(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias:
     u = x - float(i)
     v = y - float(j)
     depth = (1.0e3 - p[2] + bias) * 1.0e-3
-    upper_row = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
+    upper_row = (
+        open_texel(shadows, view_index, j, i, depth) * (1.0 - u) + open_texel(shadows, view_index, j, i + 1, depth) * u
+    )
     lower_row = (
-        open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
+        open_texel(shadows, view_index, j + 1, i, depth) * (1.0 - u)
+        + open_texel(shadows, view_index, j + 1, i + 1, depth) * u
     )
     return upper_row * (1.0 - v) + lower_row * v
 
 
 @wp.func(inline=True)
-def depth_of(keys: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int) -> float:
+def depth_of(keys: wp.array3d(dtype=wp.uint64), view_index: int, row_index: int, column: int) -> float:
     """Return how far a texel's surface is towards the sun, in thousands of metres; 0 where there is none."""
-    return wp.cast(wp.uint32(keys[view, row, column] >> wp.uint64(32)), float)
+    return wp.cast(wp.uint32(keys[view_index, row_index, column] >> wp.uint64(32)), float)
 
 
 @wp.func(inline=True)
-def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
+def soft_share(map: SunMap, view_index: int, p: wp.vec3, n: wp.vec3) -> float:
     """Return the share of the sun that reaches a point with a normal; -1 for a point outside the map.
 
     The mean distance of the occluders around the point gives the width of the penumbra (Fernando, Percentage-closer
@@ -80,13 +85,13 @@ def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
     search = map.search
     if size <= 2 * search + 1:
         return -1.0
-    to_texels = map.to_texels[view]
+    to_texels = map.to_texels[view_index]
     q = wp.transform_point(to_texels, p + n * (map.texel * 0.5))
     x = q[0] - 0.5
     y = q[1] - 0.5
     column = int(wp.floor(x + 0.5))
-    row = int(wp.floor(y + 0.5))
-    if column < search or row < search or column >= size - search or row >= size - search:
+    row_index = int(wp.floor(y + 0.5))
+    if column < search or row_index < search or column >= size - search or row_index >= size - search:
         return -1.0
     # The plane of the surface, in metres along the light for a texel to the right and one down.
     axis = wp.transform_vector(to_texels, n)
@@ -96,7 +101,7 @@ def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
     slope_y = wp.clamp(axis[1] * steepness, -limit, limit)
     own = (1.0e3 - q[2] + map.texel) * 1.0e-3
     margin = (wp.abs(slope_x) + wp.abs(slope_y)) * float(search + 1) * 1.0e-3
-    block = map.blocks[view, (row - search) / (2 * search), (column - search) / (2 * search)]
+    block = map.blocks[view_index, (row_index - search) / (2 * search), (column - search) / (2 * search)]
     if block[0] <= own - margin:
         return 1.0
     if block[1] > own + margin:
@@ -105,10 +110,10 @@ def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
     gap = float(0.0)
     count = int(0)
     for dy in range(-search, search + 1, 2):
-        across = own - (float(row + dy) - y) * slope_y * 1.0e-3
+        across = own - (float(row_index + dy) - y) * slope_y * 1.0e-3
         for dx in range(-search, search + 1, 2):
             plane = across - (float(column + dx) - x) * slope_x * 1.0e-3
-            depth = depth_of(map.keys, view, row + dy, column + dx)
+            depth = depth_of(map.keys, view_index, row_index + dy, column + dx)
             if depth > plane:
                 gap += depth - plane
                 count += 1
@@ -122,14 +127,14 @@ def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
     open_weight = float(0.0)
     weight_sum = float(0.0)
     for dy in range(-reach, reach + 1):
-        v = float(row + dy) - y
+        v = float(row_index + dy) - y
         across = own - v * slope_y * 1.0e-3
         for dx in range(-reach, reach + 1):
             u = float(column + dx) - x
             weight = 1.0 - (u * u + v * v) * inverse
             if weight > 0.0:
                 weight_sum += weight
-                if depth_of(map.keys, view, row + dy, column + dx) <= across - u * slope_x * 1.0e-3:
+                if depth_of(map.keys, view_index, row_index + dy, column + dx) <= across - u * slope_x * 1.0e-3:
                     open_weight += weight
     return open_weight / weight_sum
 
@@ -137,16 +142,16 @@ def soft_share(map: SunMap, view: int, p: wp.vec3, n: wp.vec3) -> float:
 @wp.kernel
 def gather_blocks(keys: wp.array3d(dtype=wp.uint64), block: int, lanes: int, blocks: wp.array3d(dtype=wp.vec2)):
     """Compute the depths nearest to and farthest from the sun in each block of a shadow map."""
-    view, row, lane = wp.tid()
+    view_index, row_index, lane = wp.tid()
     for column in range(lane, blocks.shape[2], lanes):
         nearest = wp.uint64(0)
         farthest = wp.uint64(0xFFFFFFFFFFFFFFFF)
         for dy in range(block):
             for dx in range(block):
-                key = keys[view, row * block + dy, column * block + dx]
+                key = keys[view_index, row_index * block + dy, column * block + dx]
                 nearest = wp.max(nearest, key)
                 farthest = wp.min(farthest, key)
-        blocks[view, row, column] = wp.vec2(
+        blocks[view_index, row_index, column] = wp.vec2(
             wp.cast(wp.uint32(nearest >> wp.uint64(32)), float), wp.cast(wp.uint32(farthest >> wp.uint64(32)), float)
         )
 
@@ -154,14 +159,14 @@ def gather_blocks(keys: wp.array3d(dtype=wp.uint64), block: int, lanes: int, blo
 @wp.kernel
 def join_blocks(blocks: wp.array3d(dtype=wp.vec2), lanes: int, square_blocks: wp.array3d(dtype=wp.vec2)):
     """Compute the same depths for each square of four blocks, by its first block."""
-    view, row, lane = wp.tid()
+    view_index, row_index, lane = wp.tid()
     count = blocks.shape[1]
     for column in range(lane, count, lanes):
         nearest = float(0.0)
         farthest = float(1.0e9)
-        for block_row in range(row, wp.min(row + 2, count)):
+        for block_row in range(row_index, wp.min(row_index + 2, count)):
             for block_column in range(column, wp.min(column + 2, count)):
-                block = blocks[view, block_row, block_column]
+                block = blocks[view_index, block_row, block_column]
                 nearest = wp.max(nearest, block[0])
                 farthest = wp.min(farthest, block[1])
-        square_blocks[view, row, column] = wp.vec2(nearest, farthest)
+        square_blocks[view_index, row_index, column] = wp.vec2(nearest, farthest)

@@ -25,6 +25,7 @@ from ssad.scenarios.static.physical.textures.card import (
 )
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
 from ssad.scenarios.static.physical.textures.inks import project_onto_gamut, share_outside
+from ssad.scenarios.static.physical.textures.perturbation import Texture
 
 CARD = TextureCard(
     "vanishing", "camouflage", {"texels": 32}, "yolov5n", "abc", "sedan:silver:0", "d", "c", 3, {"AP50": 0.1}
@@ -53,6 +54,14 @@ def test_a_texture_of_inks_is_written_only_if_they_give_all_of_its_colours(tmp_p
     shown, card = load_texture(str(tmp_path / "mine.json"))
     assert card.inks == "FOGRA39"
     assert share_outside(shown) == 0.0
+
+
+def test_a_texture_of_your_own_is_projected_on_request(tmp_path: Path) -> None:
+    save_texture(tmp_path / "mine", picture(), CARD)
+    own, projected = (Texture(str(tmp_path / "mine.json"), project=project) for project in (False, True))
+    assert share_outside(own.printed_texture().colour) > 0.3
+    assert share_outside(projected.printed_texture().colour) == 0.0
+    assert own.version() != projected.version()
 
 
 def test_a_changed_or_broken_texture_is_one_line(tmp_path: Path) -> None:

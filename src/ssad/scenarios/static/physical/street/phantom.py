@@ -221,27 +221,31 @@ def screen_mesh() -> Mesh:
 @lru_cache(maxsize=8)
 def _picture_light(picture: str) -> Tensor:
     """Return the share of the light that each texel of a picture passes [3, H, W]: the body before black."""
-    kind, style, (width, height) = PICTURES[picture]
-    random = generator("phantom", picture)
-    is_sign = kind.endswith("sign")
+    body_kind, body_style, (picture_width, picture_height) = PICTURES[picture]
+    body_generator = generator("phantom", picture)
+    is_sign = body_kind.endswith("sign")
     body_size = {"child": (0.35, 0.42, 1.15), "person": (0.45, 0.55, 1.78)}.get(picture, (0.08, 0.8, 2.8))
-    mesh = make_body(kind, style=style, size=body_size, generator=random)
-    scene = RenderScene(None, [mesh])
-    rows = TEXELS if height >= width else round(TEXELS * height / width)
-    columns = max(round(rows * width / height), 8)
-    distance = 30.0
-    focal = rows / height * distance
-    # A sign is shown without its post: the picture ends below the plate.
-    middle = body_size[2] - 0.5 * height + 0.05 if is_sign else 0.5 * height
-    intrinsic = np.array([[focal, 0.0, columns / 2], [0.0, focal, rows / 2], [0.0, 0.0, 1.0]])
-    pose = upright_pose(distance, 0.0, np.pi, middle) @ np.array(
+    body_mesh = make_body(body_kind, style=body_style, size=body_size, generator=body_generator)
+    body_scene = RenderScene(None, [body_mesh])
+    row_count = TEXELS if picture_height >= picture_width else round(TEXELS * picture_height / picture_width)
+    column_count = max(round(row_count * picture_width / picture_height), 8)
+    camera_distance = 30.0
+    focal_length = row_count / picture_height * camera_distance
+    # A sign is shown_light without its post: the picture ends below the plate.
+    centre_height = body_size[2] - 0.5 * picture_height + 0.05 if is_sign else 0.5 * picture_height
+    intrinsic = np.array([[focal_length, 0.0, column_count / 2], [0.0, focal_length, row_count / 2], [0.0, 0.0, 1.0]])
+    camera_pose = upright_pose(camera_distance, 0.0, np.pi, centre_height) @ np.array(
         [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
     )
-    camera = Camera(columns, rows, intrinsic)
-    view = View(camera, pose, (SceneObject(0, np.eye(4), (0.45, 0.1, 0.08), 1),), SceneWeather(0.9, 0.0, 0.3))
-    rendering = render(scene, [view])
-    linear = decode(np.asarray(rendering.image[0]))
-    shown: F32 = np.where((np.asarray(rendering.tag[0]) == 1)[..., None], linear, 0.0).astype(np.float32)
-    peak = max(float(np.quantile(shown[shown > 0.0], 0.98)), 1e-3) if (shown > 0.0).any() else 1.0
-    light = LEAK + (1.0 - LEAK) * (shown / peak).clip(0.0, 1.0)
-    return torch.from_numpy(np.moveaxis(light, -1, 0).astype(np.float32).copy())
+    picture_camera = Camera(column_count, row_count, intrinsic)
+    picture_view = View(
+        picture_camera, camera_pose, (SceneObject(0, np.eye(4), (0.45, 0.1, 0.08), 1),), SceneWeather(0.9, 0.0, 0.3)
+    )
+    rendering = render(body_scene, [picture_view])
+    linear_image = decode(np.asarray(rendering.image[0]))
+    shown_light: F32 = np.where((np.asarray(rendering.tag[0]) == 1)[..., None], linear_image, 0.0).astype(np.float32)
+    peak_light = (
+        max(float(np.quantile(shown_light[shown_light > 0.0], 0.98)), 1e-3) if (shown_light > 0.0).any() else 1.0
+    )
+    passed_light = LEAK + (1.0 - LEAK) * (shown_light / peak_light).clip(0.0, 1.0)
+    return torch.from_numpy(np.moveaxis(passed_light, -1, 0).astype(np.float32).copy())

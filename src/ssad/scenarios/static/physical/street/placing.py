@@ -109,31 +109,33 @@ def paint_road(  # noqa: PLR0917  # plain values
         opacity: [h, w].
         hidden: Outlines [N, 2], px, of what stands before it.
     """
-    length, width = size
-    corners = np.array([(0.5 * length, 0.5 * width), (0.5 * length, -0.5 * width)])
-    corners = np.concatenate([corners, -corners])  # far left, far right, near right, near left
-    points = np.column_stack([corners, np.zeros(4), np.ones(4)]) @ place.T
+    road_length, road_width = size
+    road_corners = np.array([(0.5 * road_length, 0.5 * road_width), (0.5 * road_length, -0.5 * road_width)])
+    road_corners = np.concatenate([road_corners, -road_corners])  # far left, far right, near right, near left
+    world_points = np.column_stack([road_corners, np.zeros(4), np.ones(4)]) @ place.T
     to_camera = np.linalg.inv(ego_to_world @ camera.to_ego)
-    in_camera = (points @ to_camera.T)[:, :3]
-    if (in_camera[:, 2] < NEAREST).any():
+    camera_points = (world_points @ to_camera.T)[:, :3]
+    if (camera_points[:, 2] < NEAREST).any():
         return image  # partly behind the camera
-    pixels = in_camera @ camera.intrinsic.T
-    pixels = (pixels[:, :2] / pixels[:, 2:]).astype(np.float32)
-    rows, columns = opacity.shape
-    source = np.array([(0, 0), (columns, 0), (columns, rows), (0, rows)], np.float32)
+    pixel_corners = camera_points @ camera.intrinsic.T
+    pixel_corners = (pixel_corners[:, :2] / pixel_corners[:, 2:]).astype(np.float32)
+    texel_rows, texel_columns = opacity.shape
+    texel_corners = np.array([(0, 0), (texel_columns, 0), (texel_columns, texel_rows), (0, texel_rows)], np.float32)
     # Pixel centres lie at half numbers in the image, at whole numbers in OpenCV.
-    homography = cv2.getPerspectiveTransform(source - 0.5, pixels - 0.5)
+    homography = cv2.getPerspectiveTransform(texel_corners - 0.5, pixel_corners - 0.5)
     frame_size = (image.shape[1], image.shape[0])
     # Beyond its edge the texture goes on, and its opacity ends.
-    warped = cv2.warpPerspective(
+    warped_texture = cv2.warpPerspective(
         texture, homography, frame_size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    share = cv2.warpPerspective(opacity.astype(np.float32), homography, frame_size, flags=cv2.INTER_LINEAR)
-    for outline in hidden:
-        cv2.fillConvexPoly(share, np.rint(outline).astype(np.int32), 0.0)
-    road = decode(image)
-    changed = road * warped / ROAD_ALBEDO if light is None else road * (1.0 + light * warped)
-    return encode(road + share[..., None] * (changed - road))
+    warped_opacity = cv2.warpPerspective(opacity.astype(np.float32), homography, frame_size, flags=cv2.INTER_LINEAR)
+    for hidden_outline in hidden:
+        cv2.fillConvexPoly(warped_opacity, np.rint(hidden_outline).astype(np.int32), 0.0)
+    road_light = decode(image)
+    changed_light = (
+        road_light * warped_texture / ROAD_ALBEDO if light is None else road_light * (1.0 + light * warped_texture)
+    )
+    return encode(road_light + warped_opacity[..., None] * (changed_light - road_light))
 
 
 def decode(image: U8) -> F32:
