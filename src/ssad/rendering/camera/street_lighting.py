@@ -84,21 +84,27 @@ def sample_road(street: Street, *, count: int = SAMPLES) -> RoadSamples:
     near_faces = np.unique(street.order[: street.offset[0, -2]])
     triangles = street.vertices[street.faces[near_faces[is_asphalt[near_faces]]]].astype(np.float64)
     areas = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    draws = generator("street lighting", street.name, street.style)
-    chosen = triangles[draws.choice(len(areas), count, p=areas / areas.sum())]
-    first, second = draws.random((2, count, 1))
+    random_draws = generator("street lighting", street.name, street.style)
+    drawn_triangles = triangles[random_draws.choice(len(areas), count, p=areas / areas.sum())]
+    first_share, second_share = random_draws.random((2, count, 1))
     # A point in the other half of the parallelogram is mirrored into the triangle.
-    first, second = np.where(first + second > 1.0, (1.0 - first, 1.0 - second), (first, second))
-    points = chosen[:, 0] + first * (chosen[:, 1] - chosen[:, 0]) + second * (chosen[:, 2] - chosen[:, 0])
+    first_share, second_share = np.where(
+        first_share + second_share > 1.0, (1.0 - first_share, 1.0 - second_share), (first_share, second_share)
+    )
+    points = (
+        drawn_triangles[:, 0]
+        + first_share * (drawn_triangles[:, 1] - drawn_triangles[:, 0])
+        + second_share * (drawn_triangles[:, 2] - drawn_triangles[:, 0])
+    )
     lamps = street.lamps.astype(np.float64)
     offsets = points[:, None] - lamps[None, :, :3]
     cosine, sine = np.cos(lamps[:, 3]), np.sin(lamps[:, 3])
     across = offsets[..., 0] * cosine + offsets[..., 1] * sine
     along = offsets[..., 1] * cosine - offsets[..., 0] * sine
     gaps = np.stack([across, along, -offsets[..., 2]], -1)
-    nearest = gaps[np.arange(count), np.hypot(across, along).argmin(1)]
-    is_lit = np.abs(nearest[:, 1]) <= 0.5 * STYLES[street.style].lamp
-    is_lit &= (nearest[:, 0] > -BEHIND) & (nearest[:, 0] < BEFORE)
+    nearest_gaps = gaps[np.arange(count), np.hypot(across, along).argmin(1)]
+    is_lit = np.abs(nearest_gaps[:, 1]) <= 0.5 * STYLES[street.style].lamp
+    is_lit &= (nearest_gaps[:, 0] > -BEHIND) & (nearest_gaps[:, 0] < BEFORE)
     return RoadSamples(points[is_lit], gaps[is_lit])
 
 
@@ -127,5 +133,5 @@ def luminaire_power(street: Street, name: str, lux: float) -> float:
     if name == UNLIT or not len(street.lamps):
         return 0.0
     samples = sample_road(street)
-    mean = float(unit_illuminance(samples).mean()) if len(samples.points) else 0.0
-    return road_illuminance(name) * lux / mean if mean > 0.0 else 0.0
+    mean_illuminance = float(unit_illuminance(samples).mean()) if len(samples.points) else 0.0
+    return road_illuminance(name) * lux / mean_illuminance if mean_illuminance > 0.0 else 0.0
