@@ -1,0 +1,98 @@
+"""Yards: paved ground behind the pavement with cells for cars, or places along the street for long vehicles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ssad.core.rotations import wrap_scalar
+from ssad.rendering.meshes.mesh import F64
+from ssad.rendering.street.free_ground import FreeGround, Side, footprint, place
+from ssad.rendering.street.model import MID, NEAR
+from ssad.rendering.street.palette import TownMaterials
+from ssad.rendering.street.paving import EARTH
+from ssad.rendering.street.triangles import ALL, TriangleBuilder, flat
+
+Pose = tuple[float, float, float]
+
+GAP = (3.0, 12.0)  # m between the yards of a side
+END = 8.0  # m from the ends of a street without a yard
+FRONT = 0.4  # m between the pavement and a yard
+CELL_WIDTH, CELL_DEPTH = 2.7, 5.6  # m, a car across the street
+ROW_PLACES, ROW_DEPTH = (10.0, 12.6, 17.6, 17.6, 17.6), 3.3  # m, places along the street: for a truck, a bus, a trailer
+CELLS, PLACES = (3, 7), (1, 3)  # numbers of cells and of places of a yard, the ends excluded
+ROWS = 0.6  # of the yards, as far as there is room
+MAX_TURN = 0.25  # rad along a yard: yards are straight
+STEP = 3.0  # m to the next attempt where there is no room
+LINE = 0.1  # m, width of the lines
+TOP = EARTH + 0.016  # m, height of a yard
+DEPTHS = (ROW_DEPTH, CELL_DEPTH)  # m, depths of yards
+
+
+@dataclass
+class Yards:
+    """Places in yards: those of `Street.parking`, and those of `Street.yards`."""
+
+    cells: list[Pose] = field(default_factory=list)
+    rows: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+
+
+def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMaterials, sides: list[Side]) -> Yards:
+    """Lay yards behind the pavements of streets, where the ground is free; return their places."""
+    rng, yards = materials.details, Yards()
+    for side in sides:
+        if not side.frontage or not side.kerb:
+            continue
+        station = END + float(rng.uniform(0.0, GAP[0]))
+        while station < side.length - END:
+            is_row = rng.random() < ROWS
+            count = int(rng.integers(*(PLACES if is_row else CELLS)))
+            width, depth = (float(rng.choice(ROW_PLACES)), ROW_DEPTH) if is_row else (CELL_WIDTH, CELL_DEPTH)
+            length = count * width
+            if station + length > side.length - END:
+                station += STEP
+                continue
+            start_yaw, end_yaw = (side.pose(station + share * length)[2] for share in (0.0, 1.0))
+            turn = abs(wrap_scalar(end_yaw - start_yaw))
+            # Where the street curves, the ends of a yard keep off the pavement: by the height of the arc.
+            front = FRONT + 0.125 * length * turn
+            x, y, yaw = side.pose(station + 0.5 * length, front)
+            pose = (x, y, yaw + np.pi)  # y points away from the street
+            half = 0.5 * length + 0.3
+            area = footprint(pose, (-half, half), (0.0, depth))
+            if turn > MAX_TURN or not ground.is_free(area, distance=0.25):
+                station += STEP
+                continue
+            _lay_yard(triangles, materials, pose, (-front, half, depth), _lines(count, width, depth, is_row=is_row))
+            ground.occupy(area)
+            middles = length * ((np.arange(count) + 0.5) / count - 0.5)
+            if is_row:
+                points = place(pose, np.column_stack([middles, np.zeros(count)])).tolist()
+                yards.rows += [(*point, yaw, depth, 0.5 * width) for point in points]
+            else:
+                points = place(pose, np.column_stack([middles, np.full(count, 0.5 * depth)])).tolist()
+                yards.cells += [(*point, yaw + 0.5 * np.pi) for point in points]
+            station += length + float(rng.uniform(*GAP))
+    return yards
+
+
+def _lines(count: int, width: float, depth: float, *, is_row: bool) -> F64:
+    """Return the white lines between places, [n, 4]: low x, low y, high x, high y in the frame of the yard."""
+    edges = width * (np.arange(count + 1) - 0.5 * count)
+    start = depth - 1.2 if is_row else 0.3
+    return np.array([(edge - 0.5 * LINE, start, edge + 0.5 * LINE, depth - 0.1) for edge in edges])
+
+
+def _lay_yard(
+    triangles: TriangleBuilder, materials: TownMaterials, pose: Pose, size: tuple[float, float, float], lines: F64
+) -> None:
+    """Pave the ground from the pavement to the back of a yard of a size (front, half length, depth), and paint its lines."""
+    front, half, depth = size
+    for rectangles, top, material, levels in (
+        (np.array([(-half, front, half, depth)]), TOP, materials.bay, ALL),
+        (lines, TOP + 0.008, materials.white, NEAR | MID),
+    ):
+        outline = rectangles[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
+        corners = np.concatenate([place(pose, outline), np.full((*outline.shape[:2], 1), top)], axis=2)
+        triangles.add(flat(corners, material, levels=levels), np.array(pose[:2]))
