@@ -66,6 +66,7 @@ PARKED = {
 }
 PARKED_GAP = 0.9  # m of that place that the vehicle leaves free
 YARD_SHARE = 0.8  # of the places of long vehicles that are taken
+SITE_ENDS = 6.0  # m of a building site before and behind its machine, together
 AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
 NOTHING = Mesh(
     np.zeros((0, 3), np.float32),
@@ -482,6 +483,7 @@ def _add_parked_vehicles(
             room = (size[0] if towing is None else towing.length) + 0.4  # walls and fences stand close
         if not clear.is_free(x, y, yaw, room, size[1]):
             continue
+        has_site_room = clear.is_free(x, y, yaw, size[0] + SITE_ENDS, size[1])
         clear.occupy(x, y, yaw, room, size[1])
         if towing is not None:
             _add_parked_trailer(population, (x, y, yaw, z), style, size, towing)
@@ -490,7 +492,8 @@ def _add_parked_vehicles(
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
         parked_body = population.make(body_kind, style, size, has_driver=False)
         population.add(parked_body, _fixed_track(x, y, facing, z), parked=True)
-        if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
+        is_site = body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3)
+        if is_site and has_site_room:
             _add_building_site(population, (x, y, yaw, z), size, prop_rng, clear)
 
 
@@ -499,7 +502,8 @@ def _draw_long_kind(shares: Mapping[str, float], random_draws: np.random.Generat
     tractor = towing_vehicle("box", (0.0, 0.0, 0.0)).length
     lengths = {kind: PARKED[kind][1] - PARKED_GAP + (tractor if kind == "trailer" else 0.0) for kind in shares}
     kinds = [kind for kind in shares if PARKED[kind][1] > LONG and lengths[kind] <= place_length]
-    weights = np.array([shares[kind] for kind in kinds])
+    # Trucks fit everywhere: a long place is rather that of a trailer.
+    weights = np.array([shares[kind] * lengths[kind] for kind in kinds])
     return str(random_draws.choice(kinds, p=weights / weights.sum()))
 
 
@@ -560,7 +564,7 @@ def _add_building_site(
             population.add(
                 population.make("pedestrian", "worker", worker_size), _fixed_track(worker_x, worker_y, worker_yaw, z)
             )
-    occupancy.occupy(x, y, yaw, size[0] + 6.0, size[1])
+    occupancy.occupy(x, y, yaw, size[0] + SITE_ENDS, size[1])
 
 
 def _add_sidewalk_bodies(

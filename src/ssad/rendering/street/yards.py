@@ -26,7 +26,7 @@ ROWS = 0.6  # of the yards, as far as there is room
 MAX_TURN = 0.25  # rad along a yard: yards are straight
 STEP = 3.0  # m to the next attempt where there is no room
 LINE = 0.1  # m, width of the lines
-TOP = EARTH + 0.016  # m, height of a yard
+TOP = EARTH + 0.024  # m, height of a yard: above the drives and paths of houses
 DEPTHS = (ROW_DEPTH, CELL_DEPTH)  # m, depths of yards
 
 
@@ -87,7 +87,7 @@ def _lines(count: int, width: float, depth: float, *, is_row: bool) -> F64:
 def _lay_yard(
     triangles: TriangleBuilder, materials: TownMaterials, pose: Pose, size: tuple[float, float, float], lines: F64
 ) -> None:
-    """Pave the ground from the pavement to the back of a yard of a size (front, half length, depth), and paint its lines."""
+    """Pave a yard of a size (front, half length, depth) from the pavement to its back, and paint its lines."""
     front, half, depth = size
     for rectangles, top, material, levels in (
         (np.array([(-half, front, half, depth)]), TOP, materials.bay, ALL),
