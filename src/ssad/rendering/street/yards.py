@@ -18,7 +18,8 @@ Pose = tuple[float, float, float]
 
 GAP = (3.0, 12.0)  # m between the yards of a side
 END = 8.0  # m from the ends of a street without a yard
-FRONT = 0.4  # m between the pavement and a yard
+FRONT, BACK = 0.4, 0.8  # m between the pavement and a yard, and from there to walls with their awnings and bins
+MARGIN = 0.6  # m beyond the first and the last place
 CELL_WIDTH, CELL_DEPTH = 2.7, 5.6  # m, a car across the street
 ROW_PLACES, ROW_DEPTH = (10.0, 12.6, 17.6, 17.6, 17.6), 3.3  # m, places along the street: for a truck, a bus, a trailer
 CELLS, PLACES = (3, 7), (1, 3)  # numbers of cells and of places of a yard, the ends excluded
@@ -27,7 +28,7 @@ MAX_TURN = 0.25  # rad along a yard: yards are straight
 STEP = 3.0  # m to the next attempt where there is no room
 LINE = 0.1  # m, width of the lines
 TOP = EARTH + 0.024  # m, height of a yard: above the drives and paths of houses
-DEPTHS = (ROW_DEPTH, CELL_DEPTH)  # m, depths of yards
+DEPTHS = (ROW_DEPTH + BACK, CELL_DEPTH + BACK)  # m that yards take
 
 
 @dataclass
@@ -59,8 +60,8 @@ def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMat
             front = FRONT + 0.125 * length * turn
             x, y, yaw = side.pose(station + 0.5 * length, front)
             pose = (x, y, yaw + np.pi)  # y points away from the street
-            half = 0.5 * length + 0.3
-            area = footprint(pose, (-half, half), (0.0, depth))
+            half = 0.5 * length + MARGIN
+            area = footprint(pose, (-half, half), (0.0, depth + BACK))
             if turn > MAX_TURN or not ground.is_free(area, distance=0.25):
                 station += STEP
                 continue
