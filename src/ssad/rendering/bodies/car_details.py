@@ -89,13 +89,14 @@ def rear_details(shell: Shell, size: Point, body: Mesh, *, detail: int, chrome: 
         draped_pieces.append(
             (
                 trapezoid(
-                    (-0.80 * half_width, bumper), (0.80 * half_width, bumper + 0.55 * (ledge - bumper)),
+                    (-0.80 * half_width, bumper),
+                    (0.80 * half_width, bumper + 0.55 * (ledge - bumper)),
                     (-0.70 * half_width, 0.70 * half_width),
                 ),
                 TRIM,
                 LIFT,
             )
-        )  # fmt: skip
+        )
     reflector_low = ledge - 0.055
     draped_pieces.append(
         (
@@ -138,9 +139,10 @@ def _tail_lamps(shell: Shell, section: F64, *, has_bar: bool) -> Pieces:
     def cell(left: float, right: float, bottom: float, top: float) -> list[Outline]:
         return mirrored(
             rectangle(
-                (inner + left * width, base + bottom * height), (inner + right * width, base + top * height),
+                (inner + left * width, base + bottom * height),
+                (inner + right * width, base + top * height),
             )
-        )  # fmt: skip
+        )
 
     # At lower detail the shell has fewer rows, and its lens is lower than the cluster.
     draped_pieces: Pieces = [

@@ -92,8 +92,9 @@ class LensLight(Perturbation):
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
             raise ConfigError(f"lens-light: source '{self.source}'; choose {' or '.join(SOURCES)}")
-        numbers = (self.distance, self.lateral, self.height, self.scatter, self.aim, self.half_angle)
-        numbers += () if self.power is None else (self.power,)
+        numbers = [self.distance, self.lateral, self.height, self.scatter, self.aim, self.half_angle]
+        if self.power is not None:
+            numbers.append(self.power)
         is_valid = bool(np.isfinite(numbers).all()) and min(self.distance, self.scatter, self.aim) >= 0.0
         is_valid &= self.aim <= 1.0 and 1e-5 <= self.half_angle <= 1.5 and self.severity in range(1, 6)
         if not is_valid or (self.power is not None and self.power < 0.0):
