@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
+from functools import cache
 
 import numpy as np
 import pytest
 
-from ssad.core.lane_graph import load_graph
 from ssad.rendering.street import cached_street
 from ssad.rendering.street.free_ground import footprint
-from ssad.rendering.street.region import survey
+from ssad.rendering.street.region import Ground, survey
 from ssad.rendering.street.yards import CELL_DEPTH, CELL_WIDTH, ROW_DEPTH, ROW_PLACES
+from ssad.world.roads import load_town
+
+
+@cache
+def ground(name: str) -> Ground:
+    return survey(load_town(name))
 
 
 @pytest.mark.parametrize("name", ["Twinford", "Oldmarket"])
 def test_yards_lie_beside_the_pavement_with_nothing_in_them(name: str) -> None:
-    graph = load_graph(str(files("ssad.world.roads.towns") / f"{name}.npz"))
-    scene, area = cached_street(graph), survey(graph)
+    scene, area = cached_street(name), ground(name)
     is_leaf = np.array([material.name.startswith("leaves") for material in scene.materials])[scene.material]
     solid = scene.vertices[np.unique(scene.faces[~is_leaf])].astype(np.float64)  # branches may hang over a yard
     upright = solid[(solid[:, 2] > 0.35) & (solid[:, 2] < 2.4), :2]
@@ -34,8 +38,7 @@ def test_yards_lie_beside_the_pavement_with_nothing_in_them(name: str) -> None:
 
 
 def test_cells_of_cars_lie_off_the_pavement_across_the_street() -> None:
-    graph = load_graph(str(files("ssad.world.roads.towns") / "Oldmarket.npz"))
-    scene, area = cached_street(graph), survey(graph)
+    scene, area = cached_street("Oldmarket"), ground("Oldmarket")
     half = 0.5 * CELL_DEPTH, 0.5 * CELL_WIDTH
     places = scene.parking.astype(np.float64)
     assert len(places) > 100
