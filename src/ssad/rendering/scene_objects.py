@@ -447,13 +447,16 @@ def _add_parked_vehicles(
     occupancy = float(rng.uniform(0.25, 0.75))
     parking_lots = [(float(x), float(y), float(yaw), YARD) for x, y, yaw in np.asarray(street.parking, float)]
     bays = np.concatenate([street.bays, street.yards]).astype(float)
-    heights = [BAY] * len(street.bays) + [YARD] * len(street.yards)
-    kerb_places = [(x, y, yaw, z) for (x, y, yaw), z in zip(bays[:, :3].tolist(), heights, strict=True)]
+    place_heights = [BAY] * len(street.bays) + [YARD] * len(street.yards)
+    kerb_places = [(x, y, yaw, z) for (x, y, yaw), z in zip(bays[:, :3].tolist(), place_heights, strict=True)]
     parking_spots = []
     for spot_index, place in enumerate([*parking_lots, *kerb_places]):
         yard_index = spot_index - len(parking_lots) - len(street.bays)
-        share = YARD_SHARE if yard_index >= 0 else occupancy
-        if np.hypot(route_points[:, 0] - place[0], route_points[:, 1] - place[1]).min() > 55.0 or rng.random() > share:
+        occupied_share = YARD_SHARE if yard_index >= 0 else occupancy
+        if (
+            np.hypot(route_points[:, 0] - place[0], route_points[:, 1] - place[1]).min() > 55.0
+            or rng.random() > occupied_share
+        ):
             continue
         if yard_index >= 0:
             body_kind = _draw_long_kind(shares, rng, 2.0 * float(street.yards[yard_index, 4]))
@@ -499,12 +502,14 @@ def _add_parked_vehicles(
 
 def _draw_long_kind(shares: Mapping[str, float], random_draws: np.random.Generator, place_length: float) -> str:
     """Draw the kind of a long vehicle that fits on a place of a yard, with a tractor before a trailer."""
-    tractor = towing_vehicle("box", (0.0, 0.0, 0.0)).length
-    lengths = {kind: PARKED[kind][1] - PARKED_GAP + (tractor if kind == "trailer" else 0.0) for kind in shares}
-    kinds = [kind for kind in shares if PARKED[kind][1] > LONG and lengths[kind] <= place_length]
+    tractor_length = towing_vehicle("box", (0.0, 0.0, 0.0)).length
+    needed_lengths = {
+        kind: PARKED[kind][1] - PARKED_GAP + (tractor_length if kind == "trailer" else 0.0) for kind in shares
+    }
+    fitting_kinds = [kind for kind in shares if PARKED[kind][1] > LONG and needed_lengths[kind] <= place_length]
     # Trucks fit everywhere: a long place is rather that of a trailer.
-    weights = np.array([shares[kind] * lengths[kind] for kind in kinds])
-    return str(random_draws.choice(kinds, p=weights / weights.sum()))
+    kind_weights = np.array([shares[kind] * needed_lengths[kind] for kind in fitting_kinds])
+    return str(random_draws.choice(fitting_kinds, p=kind_weights / kind_weights.sum()))
 
 
 def _add_parked_trailer(

@@ -48,52 +48,60 @@ def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMat
         station = END + float(rng.uniform(0.0, GAP[0]))
         while station < side.length - END:
             is_row = rng.random() < ROWS
-            count = int(rng.integers(*(PLACES if is_row else CELLS)))
+            place_count = int(rng.integers(*(PLACES if is_row else CELLS)))
             width, depth = (float(rng.choice(ROW_PLACES)), ROW_DEPTH) if is_row else (CELL_WIDTH, CELL_DEPTH)
-            length = count * width
+            length = place_count * width
             if station + length > side.length - END:
                 station += STEP
                 continue
             start_yaw, end_yaw = (side.pose(station + share * length)[2] for share in (0.0, 1.0))
-            turn = abs(wrap_scalar(end_yaw - start_yaw))
+            yaw_change = abs(wrap_scalar(end_yaw - start_yaw))
             # Where the street curves, the ends of a yard keep off the pavement: by the height of the arc.
-            front = FRONT + 0.125 * length * turn
-            x, y, yaw = side.pose(station + 0.5 * length, front)
-            pose = (x, y, yaw + np.pi)  # y points away from the street
-            half = 0.5 * length + MARGIN
-            area = footprint(pose, (-half, half), (0.0, depth + BACK))
-            if turn > MAX_TURN or not ground.is_free(area, distance=0.25):
+            street_distance = FRONT + 0.125 * length * yaw_change
+            x, y, yaw = side.pose(station + 0.5 * length, street_distance)
+            yard_pose = (x, y, yaw + np.pi)  # y points away from the street
+            half_length = 0.5 * length + MARGIN
+            yard_footprint = footprint(yard_pose, (-half_length, half_length), (0.0, depth + BACK))
+            if yaw_change > MAX_TURN or not ground.is_free(yard_footprint, distance=0.25):
                 station += STEP
                 continue
-            _lay_yard(triangles, materials, pose, (-front, half, depth), _lines(count, width, depth, is_row=is_row))
-            ground.occupy(area)
-            middles = length * ((np.arange(count) + 0.5) / count - 0.5)
+            _lay_yard(
+                triangles,
+                materials,
+                yard_pose,
+                (-street_distance, half_length, depth),
+                _lines(place_count, width, depth, is_row=is_row),
+            )
+            ground.occupy(yard_footprint)
+            middles = length * ((np.arange(place_count) + 0.5) / place_count - 0.5)
             if is_row:
-                points = place(pose, np.column_stack([middles, np.zeros(count)])).tolist()
-                yards.rows += [(*point, yaw, depth, 0.5 * width) for point in points]
+                place_points = place(yard_pose, np.column_stack([middles, np.zeros(place_count)])).tolist()
+                yards.rows += [(*point, yaw, depth, 0.5 * width) for point in place_points]
             else:
-                points = place(pose, np.column_stack([middles, np.full(count, 0.5 * depth)])).tolist()
-                yards.cells += [(*point, yaw + 0.5 * np.pi) for point in points]
+                place_points = place(yard_pose, np.column_stack([middles, np.full(place_count, 0.5 * depth)])).tolist()
+                yards.cells += [(*point, yaw + 0.5 * np.pi) for point in place_points]
             station += length + float(rng.uniform(*GAP))
     return yards
 
 
-def _lines(count: int, width: float, depth: float, *, is_row: bool) -> F64:
+def _lines(place_count: int, width: float, depth: float, *, is_row: bool) -> F64:
     """Return the white lines between places, [n, 4]: low x, low y, high x, high y in the frame of the yard."""
-    edges = width * (np.arange(count + 1) - 0.5 * count)
+    line_stations = width * (np.arange(place_count + 1) - 0.5 * place_count)
     start = depth - 1.2 if is_row else 0.3
-    return np.array([(edge - 0.5 * LINE, start, edge + 0.5 * LINE, depth - 0.1) for edge in edges])
+    return np.array(
+        [(line_station - 0.5 * LINE, start, line_station + 0.5 * LINE, depth - 0.1) for line_station in line_stations]
+    )
 
 
 def _lay_yard(
-    triangles: TriangleBuilder, materials: TownMaterials, pose: Pose, size: tuple[float, float, float], lines: F64
+    triangles: TriangleBuilder, materials: TownMaterials, yard_pose: Pose, size: tuple[float, float, float], lines: F64
 ) -> None:
-    """Pave a yard of a size (front, half length, depth) from the pavement to its back, and paint its lines."""
-    front, half, depth = size
+    """Pave a yard of a size (y of its front, half length, depth) and paint its lines."""
+    front_edge, half_length, depth = size
     for rectangles, top, material, levels in (
-        (np.array([(-half, front, half, depth)]), TOP, materials.bay, ALL),
+        (np.array([(-half_length, front_edge, half_length, depth)]), TOP, materials.bay, ALL),
         (lines, TOP + 0.008, materials.white, NEAR | MID),
     ):
         outline = rectangles[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
-        corners = np.concatenate([place(pose, outline), np.full((*outline.shape[:2], 1), top)], axis=2)
-        triangles.add(flat(corners, material, levels=levels), np.array(pose[:2]))
+        corners = np.concatenate([place(yard_pose, outline), np.full((*outline.shape[:2], 1), top)], axis=2)
+        triangles.add(flat(corners, material, levels=levels), np.array(yard_pose[:2]))
