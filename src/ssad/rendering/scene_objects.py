@@ -28,6 +28,7 @@ from ssad.world.models import SURROGATES, stated_size, trace_sizes
 Size = tuple[float, float, float]  # length, width, height
 KERB = 0.12  # m, height of sidewalks
 BAY = 0.14  # m, height of parking bays
+YARD = 0.12  # m, height of yards and drives
 BAY_EDGE = 0.2  # m between the road and a vehicle in a bay
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
@@ -63,6 +64,9 @@ PARKED = {
     "motorcycle": (1.4, 3.0),
     "bicycle": (1.6, 2.6),
 }
+PARKED_GAP = 0.9  # m of that place that the vehicle leaves free
+YARD_SHARE = 0.8  # of the places of long vehicles that are taken
+SITE_ENDS = 6.0  # m of a building site before and behind its machine, together
 AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
 NOTHING = Mesh(
     np.zeros((0, 3), np.float32),
@@ -438,32 +442,36 @@ def _add_parked_vehicles(
     clear: GroundOccupancy,
     shares: Mapping[str, float],
 ) -> None:
-    """Vehicles parked in bays and on parking places; building sites of cones and barriers round machines."""
+    """Vehicles parked in bays, yards and on parking places; building sites of cones and barriers round machines."""
     rng = generator("record kerb", *population.key)
     occupancy = float(rng.uniform(0.25, 0.75))
-    kinds, weights = list(shares), np.array(list(shares.values()))
-    parking_lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
-    bays = np.asarray(street.bays, float)
-    kerb_places = [(x, y, yaw, BAY) for x, y, yaw in bays[:, :3].tolist()]
+    parking_lots = [(float(x), float(y), float(yaw), YARD) for x, y, yaw in np.asarray(street.parking, float)]
+    bays = np.concatenate([street.bays, street.yards]).astype(float)
+    place_heights = [BAY] * len(street.bays) + [YARD] * len(street.yards)
+    kerb_places = [(x, y, yaw, z) for (x, y, yaw), z in zip(bays[:, :3].tolist(), place_heights, strict=True)]
     parking_spots = []
     for spot_index, place in enumerate([*parking_lots, *kerb_places]):
+        yard_index = spot_index - len(parking_lots) - len(street.bays)
+        occupied_share = YARD_SHARE if yard_index >= 0 else occupancy
         if (
             np.hypot(route_points[:, 0] - place[0], route_points[:, 1] - place[1]).min() > 55.0
-            or rng.random() > occupancy
+            or rng.random() > occupied_share
         ):
             continue
-        body_kind = str(rng.choice(kinds, p=weights))
-        is_long = PARKED[body_kind][1] > LONG
-        parking_spots.append(
-            (not is_long, spot_index, "car" if is_long and spot_index < len(parking_lots) else body_kind, place)
-        )
+        if yard_index >= 0:
+            body_kind = _draw_long_kind(shares, rng, 2.0 * float(street.yards[yard_index, 4]))
+        else:
+            body_kind = str(rng.choice(list(shares), p=list(shares.values())))
+            if spot_index < len(parking_lots) and PARKED[body_kind][1] > LONG:
+                body_kind = "car"
+        parking_spots.append((PARKED[body_kind][1] <= LONG, spot_index, body_kind, place))
     # Long vehicles come first: between others they would hardly find room.
     for _, spot_index, body_kind, (edge_x, edge_y, yaw, z) in sorted(parking_spots):
         mesh_number = len(population.meshes)
         prop_rng = generator("record prop", *population.key, mesh_number)
         style = "parked" if body_kind in ("motorcycle", "bicycle") else draw_style(body_kind, generator=prop_rng)
         size = draw_size(body_kind, style, generator=prop_rng)
-        size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
+        size = (min(size[0], PARKED[body_kind][1] - PARKED_GAP), min(size[1], 2.55), size[2])
         lateral_offset = 0.0
         towing = towing_vehicle(style, size) if body_kind == "trailer" else None
         if spot_index >= len(parking_lots):
@@ -474,8 +482,11 @@ def _add_parked_vehicles(
                 continue  # it would stand on the pavement
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
         room = PARKED[body_kind][1] if towing is None else towing.length + TRAILER_GAP
+        if z == YARD:
+            room = (size[0] if towing is None else towing.length) + 0.4  # walls and fences stand close
         if not clear.is_free(x, y, yaw, room, size[1]):
             continue
+        has_site_room = clear.is_free(x, y, yaw, size[0] + SITE_ENDS, size[1])
         clear.occupy(x, y, yaw, room, size[1])
         if towing is not None:
             _add_parked_trailer(population, (x, y, yaw, z), style, size, towing)
@@ -484,8 +495,21 @@ def _add_parked_vehicles(
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
         parked_body = population.make(body_kind, style, size, has_driver=False)
         population.add(parked_body, _fixed_track(x, y, facing, z), parked=True)
-        if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
+        is_site = body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3)
+        if is_site and has_site_room:
             _add_building_site(population, (x, y, yaw, z), size, prop_rng, clear)
+
+
+def _draw_long_kind(shares: Mapping[str, float], random_draws: np.random.Generator, place_length: float) -> str:
+    """Draw the kind of a long vehicle that fits on a place of a yard, with a tractor before a trailer."""
+    tractor_length = towing_vehicle("box", (0.0, 0.0, 0.0)).length
+    needed_lengths = {
+        kind: PARKED[kind][1] - PARKED_GAP + (tractor_length if kind == "trailer" else 0.0) for kind in shares
+    }
+    fitting_kinds = [kind for kind in shares if PARKED[kind][1] > LONG and needed_lengths[kind] <= place_length]
+    # Trucks fit everywhere: a long place is rather that of a trailer.
+    kind_weights = np.array([shares[kind] * needed_lengths[kind] for kind in fitting_kinds])
+    return str(random_draws.choice(fitting_kinds, p=kind_weights / kind_weights.sum()))
 
 
 def _add_parked_trailer(
@@ -545,7 +569,7 @@ def _add_building_site(
             population.add(
                 population.make("pedestrian", "worker", worker_size), _fixed_track(worker_x, worker_y, worker_yaw, z)
             )
-    occupancy.occupy(x, y, yaw, size[0] + 6.0, size[1])
+    occupancy.occupy(x, y, yaw, size[0] + SITE_ENDS, size[1])
 
 
 def _add_sidewalk_bodies(

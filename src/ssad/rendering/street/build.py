@@ -29,9 +29,10 @@ from ssad.rendering.street.paving import pave_ground
 from ssad.rendering.street.plots import build_along_streets, fill_blocks
 from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
+from ssad.rendering.street.yards import lay_yards
 from ssad.world.roads.library import load_town
 
-REVISION = 4  # of the construction: a cached street of another revision is not used
+REVISION = 5  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
@@ -61,6 +62,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     paint_markings(builder, graph, materials)
     place_signal_masts(builder, graph, free_ground, materials, masts)
     place_street_lamps(builder, free_ground, materials, street_sides, masts)
+    yards = lay_yards(builder, free_ground, materials, street_sides)
     plots = build_along_streets(builder, free_ground, materials, street_sides)
     fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
     place_furniture(builder, free_ground, materials, street_sides)
@@ -88,8 +90,9 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
         heads=_f32(masts.heads, 4),
         head_signal=np.array(masts.signal, np.int32),
         head_lens=np.array(masts.lens, np.int32).reshape(-1, 3, 2),
-        parking=_f32(plots.parking, 3),
+        parking=_f32(plots.parking + yards.cells, 3),
         bays=_f32(bays, 5),
+        yards=_f32(yards.rows, 5),
     )
 
 

@@ -56,6 +56,8 @@ class Street:
         parking: x, y, yaw of places for parked cars, off the road [., 3].
         bays: Places in parking bays at the kerb [., 5]: x, y of the side towards the road and yaw of the traffic; depth
             of the bay; room to either end of the bay, m.
+        yards: Places of long vehicles in yards behind the pavement [., 5], with the columns of `bays`; room to either
+            end of the place.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Street:
     head_lens: I32
     parking: F32
     bays: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
+    yards: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
 
     def __post_init__(self) -> None:
         # Streets are cached and shared between scenes, so their arrays must not change.
@@ -139,7 +142,7 @@ class Street:
                 getattr(self, array_name).shape == shape,
                 f"{array_name} has shape {getattr(self, array_name).shape}, not {shape}",
             )
-        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking", "bays"):
+        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking", "bays", "yards"):
             require(
                 bool(np.isfinite(getattr(self, array_name)).all()), f"{array_name} holds a number that is not finite"
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.paving import EARTH
 from ssad.rendering.street.plants import hedge
 from ssad.rendering.street.triangles import ALL, TriangleBuilder, TrianglePiece, flat
+from ssad.rendering.street.yards import DEPTHS as YARD_DEPTHS
 
 Pose = tuple[float, float, float]
 FLAT = EARTH + 0.012  # m, height of drives and yards over the earth
@@ -62,11 +64,14 @@ def build_along_streets(
             width, depth = draw_size(building_kind, materials)
             setback = float(rng.uniform(*style.setback))
             # A smaller building often fits where the full size does not.
-            for scale in (1.0, 0.75):
+            # Behind a yard it stands back; a detached house would lay its drive across the yard.
+            yard_depths = [0.0] if building_kind in DETACHED else [0.0, *YARD_DEPTHS]
+            for scale, yard_depth in product((1.0, 0.75), yard_depths):
                 size = (width * scale, depth * scale, setback)
-                if _place_building(
-                    context, plots, _facing(side, station + size[0] / 2, setback), kind=building_kind, size=size
-                ):
+                pose = _facing(side, station + size[0] / 2, setback + yard_depth)
+                if yard_depth and not ground.is_occupied(footprint(pose, (0.0, 0.0), (-setback - yard_depth, 0.0))):
+                    continue
+                if _place_building(context, plots, pose, kind=building_kind, size=size):
                     station += size[0] + float(rng.uniform(*style.gap))
                     break
             else:
