@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.types import F64
-from ssad.rendering.camera.texture import PRINTABLE, to_linear, to_printable
+from ssad.rendering.camera.texture import PRINTABLE, to_linear, to_printable, to_srgb
 from ssad.scenarios.static.physical.textures.printing import lab_of
 
 CHARACTERISATION: Final = "FOGRA39"
@@ -227,6 +227,4 @@ def _lab(albedo: Tensor) -> Tensor:
 def _colour_of(albedo: Tensor) -> Tensor:
     """Return the sRGB in 0 to 1 that `albedo_of` maps to an albedo; beyond its range, its border."""
     darkest, brightest = PRINTABLE
-    linear = ((albedo - darkest) / (brightest - darkest)).clamp(0.0, 1.0)
-    # The clamped root keeps the unused branch of `where` finite.
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+    return to_srgb(((albedo - darkest) / (brightest - darkest)).clamp(0.0, 1.0))
