@@ -112,7 +112,7 @@ class PerceivedLane:
     Its lines are y(x) = offset + heading x + curvature x^2 / 2 +- width / 2.
 
     Attributes:
-        offset: Place of its middle beside the middle of the ego, m to the left.
+        offset: Offset of its middle from the middle of the ego, m to the left.
         heading: Slope of its middle there.
         curvature: 1/m, positive to the left.
         width: m.
@@ -143,7 +143,7 @@ class DrivePerception:
         known: For each step its time, s, and the confirmed tracks.
         cameras: Its cameras.
         signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
-        lanes: For each step of a lane keeper its time, s, and the lane; None: it knew of none.
+        lanes: For each step of a lane keeper its time, s, and the lane; None before it has detected one.
     """
 
     detections: Sequence[tuple[float, Objects | None]]
