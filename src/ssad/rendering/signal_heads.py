@@ -41,7 +41,7 @@ def lens_emission(state: SignalState) -> float:
     """Return the emission of a lit lens in an image.
 
     Its luminance is that of `LENS_CANDELA` on the scale of noon. The renderer compresses the range of daylight, so at
-    night the lens is darker than its published luminance: its colour does not drown in the sensor.
+    night the lens is darker than its published luminance, and the sensor does not clip its colour.
     """
     luminance = LENS_CANDELA / (np.pi * LENS**2)
     # A white surface has the luminance of its illuminance over pi.

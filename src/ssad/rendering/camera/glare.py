@@ -1,4 +1,4 @@
-"""Glare of a lens: the share of light that it scatters, and the ghosts that reflections between its surfaces make.
+"""Glare of a lens: the light that it scatters, and the ghosts that reflections between its surfaces make.
 
 A point of light is surrounded by a veil that falls with the angle t (degrees) as 10 / t^3 + 5 / t^2, for each lux at
 the lens: the disability glare of the eye of a young person (CIE 146:2002, valid from 0.1 degrees), times the glare of
@@ -287,8 +287,8 @@ def add_glow(
 ) -> None:
     """Add the glow of lamps to the radiance of views at night whose sensor scatters.
 
-    Images show lamps far darker than they are, so that their colours do not drown. Their glow has the light of their
-    luminance.
+    Images show lamps far darker than they are, so that the sensor does not clip their colours. Their glow has the light
+    of their luminance.
 
     Args:
         radiance: Linear [B, H, W], a Warp array of vec3; changed in place.
