@@ -302,6 +302,7 @@ NOT_OBJECTS: dict[str, str] = {
     # choices that the kinds themselves make, in code of their own
     "ScenarioSuite.cluster": "what is drawn independently",
     "TrafficSuite.drivers": "how the drivers of background traffic are drawn",
+    "PerceivingSystem.steers_by": "the route, or the lane keeper of SSAD",
     "ScenarioSuite.sweep": "values of parameters, or the word `grid`",
     "ScenarioSuite.sweep_mode": "how the values of a sweep are combined",
     "ScenarioSuite.matrix": "parameters of a sweep",
