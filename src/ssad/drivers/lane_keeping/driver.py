@@ -3,9 +3,9 @@
     camera -> road seen from above -> markings -> lane filter -> pure pursuit -> steering
     perceiver -> tracker -> belief -> distance -> throttle and brake
 
-It perceives other road users as every perceiving driver does. The map does not steer: where no markings are in view,
-the lane keeper extrapolates the last lane by its own motion. After `PATIENCE` it slows down and stops, as systems do
-whose driver does not take over.
+It perceives other road users as every perceiving driver does. It steers without the map; speed limit and traffic lights
+are those of the observation. Where no markings are in view, it extrapolates the last lane by its own motion. After
+`PATIENCE` it slows down and stops, as systems do whose driver does not take over.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
 
 
 def lamp_gains(scene: RenderScene) -> F64:
-    """Return the light that the lamps of a scene have at night beyond that of an image, and the least of a lit one.
+    """Return the light that the lamps of a scene have at night beyond that of an image, and the least that is lit.
 
     Args:
         scene: Street and bodies.

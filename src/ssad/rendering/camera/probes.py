@@ -125,7 +125,7 @@ def _probe_table(scene: RenderScene, centres: list[F64], texels: list[Any], rows
 
 
 def _probe_views(scene: RenderScene, view: View, centre: F64) -> VisibilityPass:
-    """Return what the four sides and the sky above a place show."""
+    """Return the visibility pass towards the four sides and the sky above a place."""
     poses = _probe_poses(centre)
     far = np.array([FAR] * 4 + [FAR_UP])
     draws = scene.gather_draw_calls(

@@ -151,7 +151,7 @@ def project_onto_gamut(colour: Tensor) -> Tensor:
 
 
 def _nearest_tones(colours: Tensor) -> Tensor:
-    """Return tones [N, 4] for colours [N, 3] in sRGB: the best of a lattice, then of ever finer steps around it."""
+    """Return tones [N, 4] for colours [N, 3] in sRGB: the nearest, without black ink where that is enough."""
     target = _lab(_albedo(colours.T)).T
     tones = _search(target, black=False)
     is_reached = _residual(tones, target).norm(dim=1) <= 0.5 * TOLERANCE
