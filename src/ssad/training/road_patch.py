@@ -41,7 +41,7 @@ LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
 
 @dataclass(frozen=True, slots=True)
 class RoadApproach:
-    """A drive over a straight road towards the patch.
+    """Drive over a straight road towards the patch.
 
     Attributes:
         speed: m/s.
