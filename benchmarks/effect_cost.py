@@ -35,14 +35,14 @@ FINISH = Finish(metallic=0.5, dirt=0.5, wear=0.5)
 
 
 def seconds_of(run: Callable[[], object]) -> float:
-    """Process time of a call."""
+    """Return the process time of a call."""
     begin = time.process_time()
     run()
     return time.process_time() - begin
 
 
 def cost(base: Callable[[], object], changed: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Return the median seconds of a call, and of what another takes in addition, in turn."""
+    """Return the median seconds of a call, and the median additional seconds of another, measured in turn."""
     for run in (base, changed):
         run()
     pairs = [(seconds_of(base), seconds_of(changed)) for _ in range(repeats)]
@@ -56,7 +56,7 @@ def views_of(view: View) -> dict[str, View]:
     heading = float(np.arctan2(view.pose[1, 2], view.pose[0, 2]))
     low = replace(view.weather, sun_height=0.15, sun_heading=heading + 0.1)
     wet = replace(view.weather, wet=0.8, clouds=0.8)
-    wide = Camera.typical(640, 384)
+    wide_camera = Camera.typical(640, 384)
     dark = SceneWeather(-0.15, 0.9)
     signals = int(LampSignal.BRAKE | LampSignal.LEFT)
     night = replace(
@@ -67,15 +67,15 @@ def views_of(view: View) -> dict[str, View]:
     )
     return {
         "640 x 640": view,
-        "640 x 384": replace(view, camera=wide),
+        "640 x 384": replace(view, camera=wide_camera),
         "640 x 640, low sun": replace(view, weather=low),
         "640 x 640, wet": replace(view, weather=wet),
         "640 x 640, night": night,
-        "640 x 384, night": replace(night, camera=wide),
+        "640 x 384, night": replace(night, camera=wide_camera),
     }
 
 
-def finished(view: View) -> View:
+def with_finish(view: View) -> View:
     """Return the view with a finish on everything that wears no texture."""
     return replace(view, objects=tuple(replace(scene_object, finish=FINISH) for scene_object in view.objects))
 
@@ -84,21 +84,21 @@ def measure(stage: RenderScene, view: View, names: list[str], repeats: int) -> d
     """Return the milliseconds of a view without effects, and of each effect in addition."""
     plain = RenderQuality(effects=NO_EFFECTS)
     base = partial(render, stage, [view], quality=plain, download=False)
-    found: dict[str, Any] = {}
+    costs: dict[str, Any] = {}
     for name in names:
         if name == "finish":
-            changed = partial(render, stage, [finished(view)], quality=plain, download=False)
+            changed = partial(render, stage, [with_finish(view)], quality=plain, download=False)
         else:
             quality = RenderQuality(effects=select_effects(name))
             changed = partial(render, stage, [view], quality=quality, download=False)
         before, additional = cost(base, changed, repeats)
-        found.setdefault("ms_without", 1e3 * before)
-        found[name] = {"ms": 1e3 * additional, "ratio": additional / before}
-    return found
+        costs.setdefault("ms_without", 1e3 * before)
+        costs[name] = {"ms": 1e3 * additional, "ratio": additional / before}
+    return costs
 
 
 def main() -> None:
-    """Measures, prints, writes JSON."""
+    """Measure the costs, print them, and write JSON."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--effects", default=",".join([*EFFECTS, "finish"]))
     parser.add_argument("--repeats", type=int, default=9)

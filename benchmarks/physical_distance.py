@@ -37,7 +37,7 @@ def standalone(svg: str) -> str:
 
 
 def write_figures(folder: Path, name: str, out: Path = IMAGES) -> list[str]:
-    """Write the figures of a run; the Markdown that shows them."""
+    """Write the figures of a run, and return the Markdown that shows them."""
     lines = []
     for title, svg in approach_figures(PhysicalRun(load_run(folder))):
         slug = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
@@ -48,12 +48,12 @@ def write_figures(folder: Path, name: str, out: Path = IMAGES) -> list[str]:
 
 
 def main() -> None:
-    """Write, and print what shows it."""
+    """Write the figures, and print the Markdown that shows them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--name", default="physical")
-    given = parser.parse_args()
-    print("\n\n".join(write_figures(given.run, given.name)))
+    options = parser.parse_args()
+    print("\n\n".join(write_figures(options.run, options.name)))
 
 
 if __name__ == "__main__":

@@ -3,9 +3,9 @@
     python -m benchmarks.reality DATA [--human ARCHIVE] [--name NAME]   # measures, and appends to the log
     python -m benchmarks.reality --page                                 # writes the page from what was measured
 
-DATA: a folder of annotated photographs (docs/how-to/test-on-photographs.md). ARCHIVE: what `npm pack @vladmandic/human`
-writes; without it the column of the detector that learned from photographs stays as it was. The suite is `reality`, as
-shipped: nothing in it was chosen on photographs. Each evaluation of a detector is a line of
+DATA: a folder of annotated photographs (docs/how-to/test-on-photographs.md). ARCHIVE: the file that `npm pack
+@vladmandic/human` writes; without it, the detector that learned from photographs is left out. The suite is `reality`,
+as shipped: nothing in it was chosen on photographs. Each evaluation of a detector is a line of
 benchmarks/results/reality-log.jsonl, which is never shortened.
 """
 
@@ -35,7 +35,7 @@ FLAT = ("yolov5n", "yolov3-tiny")
 SOLID = ROOT / "benchmarks" / "reality-solid.yaml"
 PHOTO = "centernet-photo"
 PROBE = ("yolov5n", "adv-patch-yolov5n-twinford")
-TITLES = {"recall": "recall", "precision": "precision", "AP50": "AP50", "margin": "margin"}
+METRICS = ("recall", "precision", "AP50", "margin")
 
 
 def commit() -> str:
@@ -110,7 +110,7 @@ def detector_table(entry: Mapping[str, Any]) -> list[str]:
     ]
     for row in clean_rows(entry):
         source = "photographs (COCO)" if row["detector"] == PHOTO else "SSAD's images"
-        figures = [number(row, name) for name in TITLES]
+        figures = [number(row, name) for name in METRICS]
         counts = [number(row, name, scale=1.0, digits=1) for name in ("boxes", "wrong")]
         lines.append(f"| `{row['detector']}` | {source} | {row['n']} | " + " | ".join([*figures, *counts]) + " |")
     return lines
@@ -144,10 +144,10 @@ def texture_table(entry: Mapping[str, Any]) -> list[str]:
         "| Detector | Texture | Pasted | Cars | Found, % | Mean score | Hidden, % |",
         "|---|---|---|---:|---:|---:|---:|",
     ]
-    worn = [row for row in entry["rows"] if row["pasted"] != "clean"]
-    for detector in dict.fromkeys(row["detector"] for row in worn):
+    texture_rows = [row for row in entry["rows"] if row["pasted"] != "clean"]
+    for detector in dict.fromkeys(row["detector"] for row in texture_rows):
         clean = next(row for row in clean_rows(entry) if row["detector"] == detector)
-        for row in [clean, *(row for row in worn if row["detector"] == detector)]:
+        for row in [clean, *(row for row in texture_rows if row["detector"] == detector)]:
             texture = f"`{row['texture']}`" if row["texture"] else ""
             cells = [number(row, "found"), number(row, "score", scale=1.0, digits=2), number(row, "hidden")]
             lines.append(
@@ -157,7 +157,7 @@ def texture_table(entry: Mapping[str, Any]) -> list[str]:
 
 
 def probe(entry: Mapping[str, Any]) -> str:
-    """Return what a patch and its controls do to real cars, in a sentence."""
+    """Return the scores of real cars with a patch and its controls, in sentences."""
     detector, texture = PROBE
     clean = next(row for row in clean_rows(entry) if row["detector"] == detector)
     rows = {row["pasted"]: row for row in entry["rows"] if row["detector"] == detector and row["texture"] == texture}
@@ -172,10 +172,11 @@ def probe(entry: Mapping[str, Any]) -> str:
 
 
 def summary_of(entry: Mapping[str, Any], detector: str) -> str:
-    """Return what a detector finds in photographs, in a clause."""
+    """Return the objects that a detector finds in photographs, and its wrong boxes, in a clause."""
     row = next(row for row in clean_rows(entry) if row["detector"] == detector)
-    found = round(row["metrics"]["recall"] * row["n"])
-    return f"{found} of {row['n']} objects, with {row['metrics']['wrong']:.1f} wrong boxes in a photograph"
+    found_count = round(row["metrics"]["recall"] * row["n"])
+    wrong_boxes = f"{row['metrics']['wrong']:.1f} wrong boxes in a photograph"
+    return f"{found_count} of the {row['n']} objects of its classes, with {wrong_boxes}"
 
 
 def evaluations() -> list[str]:
@@ -202,15 +203,15 @@ def write_page() -> None:
     """Write the page, the passages of other pages that quote it, and the figures in the cards of the weights."""
     stored: Mapping[str, Any] = json.loads(RESULTS.read_text())
     first = next(iter(stored.values()))
-    shown = ", ".join(f"`{name}` {value.split()[0]}" for name, value in first["weights"].items())
+    weights = ", ".join(f"`{name}` {value.split()[0]}" for name, value in first["weights"].items())
     lines = [
         "# Detectors on photographs",
         "",
-        f"> **Stored result.** Commit: {first['commit']}. Weights: {shown}. Torch: {first['torch']}. Make it anew: "
+        f"> **Stored result.** Commit: {first['commit']}. Weights: {weights}. Torch: {first['torch']}. Make it anew: "
         "`python -m benchmarks.reality DATA --human ARCHIVE`, then `python -m benchmarks.reality --page`.",
         "",
         "The shipped detectors learned from images that SSAD renders. None of them has seen a photograph. This page "
-        "says what they find in photographs, beside a detector that learned from photographs (COCO): the CenterNet of "
+        "has their scores in photographs, beside a detector that learned from photographs (COCO): the CenterNet of "
         "the npm package `@vladmandic/human` "
         "([how to use it](../how-to/use-detectors.md#a-detector-that-learned-from-photographs)).",
         "",
@@ -258,14 +259,14 @@ def write_page() -> None:
         # Figures of other weights say nothing about these.
         if card.is_file() and state_hash(make_detector(row["detector"])) == measured:
             content = json.loads(card.read_text())
-            figures = {name: row["metrics"][name] for name in (*TITLES, "wrong")} | {"objects": row["n"]}
+            figures = {name: row["metrics"][name] for name in (*METRICS, "wrong")} | {"objects": row["n"]}
             content["photographs"] = {name: value for name, value in figures.items() if value is not None}
             content.setdefault("learned_from", "images that SSAD rendered; no photographs")
             card.write_text(dump_json(dict(sorted(content.items())), indent=1) + "\n")
 
 
 def quotation(entry: Mapping[str, Any], folder: str) -> str:
-    """Return what detectors find in photographs, in a sentence for another page.
+    """Return the scores of detectors in photographs, in a sentence for another page.
 
     Args:
         entry: Results on some photographs.

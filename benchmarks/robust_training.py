@@ -1,11 +1,11 @@
-"""Adversarial training against a control that went on from the same weights for as many steps without attacks.
+"""Adversarial training against a control that continues from the same weights for as many steps without attacks.
 
     python -m benchmarks.robust_training fcos3d-light --data DRIVES --weights W.safetensors --out DIR --device cuda
     python -m benchmarks.robust_training --out DIR --page        # docs/results/robust-training.md
 
 Both arms have one recipe, one seed, the same images in the same order and the same number of steps; they differ in
-`radius` alone. Nothing of the difference is then due to more training, other data or an older start. Both are attacked
-by the suite `digital`, each by itself. A stopped run goes on.
+`radius` and `attack_steps` alone, so no difference comes from more training, other data or an older start. The suite
+`digital` attacks each of them by itself. A stopped run continues when it is started again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def arms(recipe: str, data: Path, weights: Path, out: Path, *, settings: list[st
     """Return the plans of both arms; the control is the recipe without attacks.
 
     Raises:
-        ConfigError: The settings do not say a radius above 0.
+        ConfigError: The settings have no radius above 0.
     """
     changes = dict(parse_changes(settings))
     if not changes.get("radius", 0.0) > 0.0:
@@ -53,7 +53,7 @@ def arms(recipe: str, data: Path, weights: Path, out: Path, *, settings: list[st
 
 
 def check_fairness(control: WeightsCard, robust: WeightsCard) -> dict[str, Any]:
-    """Return what both trainings have in common, and the radius.
+    """Return the settings that both trainings share, and the radius.
 
     Raises:
         ConfigError: They differ in anything but the attacks, or one of them started at random.
@@ -64,9 +64,9 @@ def check_fairness(control: WeightsCard, robust: WeightsCard) -> dict[str, Any]:
     if different:
         raise ConfigError(f"the arms differ in {', '.join(different)}; train them anew, with one command")
     if "first_weights" not in control.config:
-        raise ConfigError("the arms started from random weights; name those to go on from with --weights")
+        raise ConfigError("the arms started from random weights; name initial weights with --weights")
     if control.config.get("radius") or not robust.config.get("radius"):
-        raise ConfigError("the control is trained without attacks, the other arm with them")
+        raise ConfigError("the control needs a training without attacks, the other arm one with them; train them anew")
     shared = {key: control.config[key] for key in ("epochs_done", "batch", "lr")}
     return shared | {"first_weights": control.config["first_weights"], "radius": robust.config["radius"]}
 
@@ -74,9 +74,9 @@ def check_fairness(control: WeightsCard, robust: WeightsCard) -> dict[str, Any]:
 def attack(recipe: str, out: Path, device: str, settings: list[str]) -> None:
     """Attack both arms by the suite `digital`; OUT/attacks is its results folder."""
     detectors = [f"{arm}={out / arm / f'{recipe}.safetensors'}" for arm in (CONTROL, ROBUST)]
-    given = [f"detectors=[{recipe}@{detectors[0]}]", f"hardened=[{recipe}@{detectors[1]}]", *SUITE, *settings]
+    overrides = [f"detectors=[{recipe}@{detectors[0]}]", f"hardened=[{recipe}@{detectors[1]}]", *SUITE, *settings]
     command = [sys.executable, "-m", "ssad", "run", "digital", "--out", str(out / "attacks"), "--device", device]
-    subprocess.run([*command, *(part for setting in given for part in ("--set", setting))], check=True)
+    subprocess.run([*command, *(part for setting in overrides for part in ("--set", setting))], check=True)
 
 
 def page(out: Path) -> str:
@@ -87,17 +87,17 @@ def page(out: Path) -> str:
 
 
 def page_text(control: WeightsCard, robust: WeightsCard, run: DigitalRun) -> str:
-    """Return the page: what the arms have in common, and the table of both."""
+    """Return the page: the settings that the arms share, and the table of both."""
     shared = check_fairness(control, robust)
     first = shared["first_weights"]
     origin = f"`{first['file']}`" + (f" ({first['hash'][:12]})" if "hash" in first else "")
     lines = [
         "# Adversarial training, compared fairly",
         "",
-        f"Both arms went on from {origin} for {shared['epochs_done']} epochs of the same images in the same order "
+        f"Both arms continued from {origin} for {shared['epochs_done']} epochs of the same images in the same order "
         f"(batch {shared['batch']}, learning rate {shared['lr']:g}). One of them attacked each image within "
         f"{shared['radius']:g} code values before it learned from it; the control, which is the ordinary one of the "
-        "table, did not. So the difference is due to the attacks alone.",
+        "table, did not. Nothing else differs between them.",
         "",
         f"Commands: `{control.command}`, `{robust.command}`, `{run.run.command}`.",
         "",
@@ -112,24 +112,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recipe", nargs="?", default="fcos3d-light")
     parser.add_argument("--data", type=Path, help="recorded drives, with the splits train and val")
-    parser.add_argument("--weights", type=Path, help="weights from which both arms go on")
+    parser.add_argument("--weights", type=Path, help="initial weights of both arms")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--set", action="append", default=[], dest="settings", help="values of the recipe of both arms")
     parser.add_argument("--suite", action="append", default=[], help="keys of the suite digital")
     parser.add_argument("--page", action="store_true")
-    given = parser.parse_args()
-    if given.page:
-        safeio.write_atomic(DOCUMENT, page(given.out))
+    options = parser.parse_args()
+    if options.page:
+        safeio.write_atomic(DOCUMENT, page(options.out))
         return
-    if given.data is None or given.weights is None:
+    if options.data is None or options.weights is None:
         parser.error("--data and --weights are needed to train")
-    for plan in arms(given.recipe, given.data, given.weights, given.out, settings=given.settings, device=given.device):
+    for plan in arms(
+        options.recipe, options.data, options.weights, options.out, settings=options.settings, device=options.device
+    ):
         for line in run_training(plan):
             print(line, flush=True)
-    check_fairness(*(read_card(given.out / arm / f"{given.recipe}.safetensors") for arm in (CONTROL, ROBUST)))
-    attack(given.recipe, given.out, "cpu" if given.device == "auto" else given.device, given.suite)
-    print(page(given.out))
+    check_fairness(*(read_card(options.out / arm / f"{options.recipe}.safetensors") for arm in (CONTROL, ROBUST)))
+    attack(options.recipe, options.out, "cpu" if options.device == "auto" else options.device, options.suite)
+    print(page(options.out))
 
 
 if __name__ == "__main__":

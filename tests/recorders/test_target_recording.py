@@ -37,9 +37,9 @@ def test_an_empty_approach_leaves_the_identity_of_a_recording(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"approach": (5.0, 81.0)}, "approach: 3 to 80 m"),
+        ({"approach": (5.0, 81.0)}, "give distances from 3 to 80 m"),
         ({"approach": (5.0, 80.0), "size": 320}, "a car 80 m away needs 431"),
-        ({"approach": (5.0, 20.0), "mode": "orbit"}, "an orbit has distances"),
+        ({"approach": (5.0, 20.0), "mode": "orbit"}, "give distances for an orbit"),
     ],
 )
 def test_an_approach_that_cannot_be_recorded_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:

@@ -60,9 +60,9 @@ def test_bodies_are_added_and_signs_are_replaced_or_gone() -> None:
 
 
 def test_what_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no layers and no cards"):
+    with pytest.raises(ConfigError, match="layers and cards need a target"):
         StreetEdit(SceneEdit(layers=(TextureLayer(0),), textures={0: torch.ones(3, 1, 1)}))
-    with pytest.raises(ConfigError, match="a distance from 0"):
+    with pytest.raises(ConfigError, match="a distance along the route from 0"):
         StreetEdit(place=(-1.0, 0.0))
     suite = SensorSuite().with_street_edit(StreetEdit())
     with pytest.raises(ConfigError, match="one texture or light at a time"):

@@ -8,8 +8,8 @@ import torch
 from ssad.drivers.lane_keeping import markings
 from ssad.drivers.lane_keeping.lane import LaneFilter
 from ssad.drivers.lane_keeping.markings import RoadGrid
-from ssad.rendering.camera.texture import to_linear
-from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, DIRT, WIDE
+from ssad.rendering.camera.texture import to_linear, to_srgb
+from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, COVERING_WIDTH, DIRT
 from ssad.training.road_patch import (
     LaneModel,
     RoadApproach,
@@ -18,7 +18,6 @@ from ssad.training.road_patch import (
     marking_strength,
     road_brightness,
     start_patch,
-    to_srgb,
     train_road_patch,
 )
 
@@ -52,14 +51,14 @@ def test_strength_and_filter_agree_with_those_of_the_lane_keeper() -> None:
 def test_without_dirt_it_keeps_its_lane_and_a_drifting_line_leads_it_away() -> None:
     with torch.no_grad():
         clean = deviation(CLEAN, APPROACH, GRID, seconds=1.5)
-        share = start_patch(WIDE, shift=1.6, seed=0)
+        share = start_patch(COVERING_WIDTH, shift=1.6, seed=0)
         dirty = deviation(DIRT[0] + (DIRT[1] - DIRT[0]) * share, APPROACH, GRID, seconds=1.5)
     assert float(clean.abs().max()) < 0.2
     assert float(dirty[-1]) > 0.5
 
 
 def test_the_deviation_has_a_gradient_and_training_keeps_to_the_greys_of_dirt() -> None:
-    patch = (DIRT[0] + (DIRT[1] - DIRT[0]) * start_patch(WIDE, shift=1.6, seed=0)).requires_grad_()
+    patch = (DIRT[0] + (DIRT[1] - DIRT[0]) * start_patch(COVERING_WIDTH, shift=1.6, seed=0)).requires_grad_()
     deviation(patch, APPROACH, GRID, seconds=0.3)[-1].backward()
     assert patch.grad is not None
     assert float(patch.grad.abs().max()) > 0.0

@@ -17,7 +17,7 @@ from ssad.core.image_files import (
     turn_back,
 )
 from ssad.core.safeio import write_atomic
-from ssad.core.types import U8
+from ssad.core.types import F32, U8
 
 __all__ = [
     "add_caption",
@@ -101,6 +101,19 @@ def add_caption(image: U8, caption: str, width: int) -> U8:
         scale -= 0.05
     cv2.putText(caption_band, caption, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, scale, (30, 30, 30), 1, cv2.LINE_AA)
     return np.pad(np.vstack([resized, caption_band]), ((2, 0), (2, 2), (0, 0)), constant_values=255)
+
+
+def decode_srgb(image: U8) -> F32:
+    """Return the linear values of an sRGB image, 0 to 1."""
+    share = image.astype(np.float32) / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encode_srgb(linear: F32) -> U8:
+    """Return the sRGB image of linear values; values above 1 become white."""
+    clipped = np.clip(linear, 0.0, 1.0)
+    share = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055)
+    return np.rint(255.0 * share).astype(np.uint8)
 
 
 def save_picture(path: Path, image: U8) -> None:

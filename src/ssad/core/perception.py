@@ -101,6 +101,10 @@ def no_tracks() -> Tracks:
     return Tracks(integers, integers, pairs, pairs, floats, pairs, integers, floats)
 
 
+LANE_CONFIDENCE: Final = 0.7
+"""Confidence of a `PerceivedLane` from which on its markings count as detected."""
+
+
 @dataclass(frozen=True, slots=True)
 class PerceivedLane:
     """Lane in the ego's frame at a moment, as a driver perceives it.
@@ -108,7 +112,7 @@ class PerceivedLane:
     Its lines are y(x) = offset + heading x + curvature x^2 / 2 +- width / 2.
 
     Attributes:
-        offset: Place of its middle beside the middle of the ego, m to the left.
+        offset: Offset of its middle from the middle of the ego, m to the left.
         heading: Slope of its middle there.
         curvature: 1/m, positive to the left.
         width: m.
@@ -121,9 +125,13 @@ class PerceivedLane:
     width: float
     confidence: float
 
-    def middle(self, ahead: float) -> float:
-        """Return the place of the middle of the lane `ahead` m in front, m to the left."""
-        return self.offset + self.heading * ahead + 0.5 * self.curvature * ahead * ahead
+    def middle(self, distance: float) -> float:
+        """Return the place of the middle of the lane at a distance ahead of the ego, m to the left.
+
+        Args:
+            distance: m ahead of the middle of the ego.
+        """
+        return self.offset + self.heading * distance + 0.5 * self.curvature * distance * distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +143,7 @@ class DrivePerception:
         known: For each step its time, s, and the confirmed tracks.
         cameras: Its cameras.
         signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
-        lanes: For each step of a lane keeper its time, s, and the lane; None: it knew of none.
+        lanes: For each step of a lane keeper its time, s, and the lane; None before it has detected one.
     """
 
     detections: Sequence[tuple[float, Objects | None]]

@@ -1,8 +1,8 @@
 """Annotated photographs in the forms of COCO, KITTI, nuScenes and BDD100K, and in lists of single photographs.
 
 Classes are those of nuScenes's detection task, stop signs and traffic lights; each form's names are mapped to them.
-Objects that are neither one of these nor something else (KITTI's DontCare, vans and cyclists, BDD100K's riders and
-trains, COCO's crowds) are ignored: a box on them is neither right nor wrong. Photographs are read in place.
+Objects that a form leaves open (KITTI's DontCare, vans and cyclists, BDD100K's riders and trains, COCO's crowds) are
+ignored: a box on them is neither right nor wrong. Photographs are read in place.
 
 Sources: cocodataset.org, format-data; Geiger et al., Are we ready for autonomous driving? (2012), devkit of the object
 benchmark; nuscenes.org, schema of version 1.0; Yu et al., BDD100K (2020), format of the label files.
@@ -46,9 +46,9 @@ CLASS_OF_NAME: Final[Mapping[str, str]] = {
         ("van", "person_sitting", "cyclist", "tram", "misc", "dontcare", "rider", "train", "other", IGNORED), IGNORED
     ),
 }
-"""Lower-case name of a form or of a detector -> class of `CLASSES`, or `IGNORED`; absent: neither."""
+"""Lower-case name of a form or of a detector -> class of `CLASSES`, or `IGNORED`; other names are left out."""
 COCO_NAMES: Final = frozenset({"train"})
-"""Names that COCO uses for what is no road user: not ignored there."""
+"""Names that in COCO mean no road user, and are left out instead of ignored."""
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 NO_SOLID: Final = (np.nan,) * 7
 NOT_A_NUMBER: Final = re.compile(r"(?<=[\[,:\s])NaN(?=[\],}\s])")  # Python's json writes it, which JSON does not have
@@ -56,7 +56,7 @@ NOT_A_NUMBER: Final = re.compile(r"(?<=[\[,:\s])NaN(?=[\],}\s])")  # Python's js
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """One photograph with its N annotated objects.
+    """Photograph with its N annotated objects.
 
     Attributes:
         name: Name in records and on pages: the path below its folder.
@@ -112,8 +112,8 @@ class PhotographSet:
         count = len(self.photographs)
         if count <= limit:
             return self
-        rows = [index * count // limit for index in range(limit)]
-        return replace(self, photographs=tuple(self.photographs[object_row] for object_row in rows))
+        indices = [number * count // limit for number in range(limit)]
+        return replace(self, photographs=tuple(self.photographs[index] for index in indices))
 
 
 def class_of(name: str) -> str:
@@ -127,7 +127,7 @@ def read_photographs(path: Path, split: str = "") -> PhotographSet:
     Args:
         path: COCO: folder with annotations/*.json, or such a file. KITTI: folder with image_2 and label_2, or with
             training. nuScenes: root of a data set. BDD100K: folder with labels and images. Else a folder with JSON
-            files that list photographs (docs/reference/formats.md).
+            files that list photographs (docs/how-to/test-on-photographs.md).
         split: Split of the photographs, such as val2017; "": all of them, or the only file.
 
     Raises:
@@ -160,18 +160,14 @@ def _annotation_files(folder: Path, split: str) -> list[Path]:
         if not files:
             continue
         if pattern == "*.json":
-            return [image_file for image_file in files if not split or split in image_file.stem]
-        matching = [
-            image_file
-            for image_file in files
-            if split and (image_file.stem == split or image_file.stem.endswith(f"_{split}"))
-        ]
-        # Of COCO's files of a split, those of objects: captions and keypoints are beside them.
-        matching = [image_file for image_file in matching if image_file.stem.startswith("instances_")] or matching
+            return [file for file in files if not split or split in file.stem]
+        matching = [file for file in files if split and (file.stem == split or file.stem.endswith(f"_{split}"))]
+        # COCO has files of captions and keypoints beside those of objects.
+        matching = [file for file in matching if file.stem.startswith("instances_")] or matching
         candidates = matching or ([] if split else files)
         if len(candidates) == 1:
             return candidates
-        names = ", ".join(image_file.relative_to(folder).as_posix() for image_file in files[:8])
+        names = ", ".join(file.relative_to(folder).as_posix() for file in files[:8])
         problem = f"no split '{split}'" if split and not candidates else "several files of annotations"
         raise ConfigError(f"{folder}: {problem} ({names}); name one as the split, or give the file")
     return []
@@ -179,16 +175,16 @@ def _annotation_files(folder: Path, split: str) -> list[Path]:
 
 def _read_json_files(files: Sequence[Path], split: str) -> PhotographSet:
     """Read files of one form; only lists of photographs may be several."""
-    sets = [_read_json_file(image_file, split) for image_file in files]
+    sets = [_read_json_file(file, split) for file in files]
     if len({photographs.form for photographs in sets}) > 1 or (len(sets) > 1 and sets[0].form != "list"):
-        names = ", ".join(image_file.name for image_file in files)
-        raise ConfigError(f"{files[0].parent}: several files of annotations ({names}); give one of them")
+        names = ", ".join(file.name for file in files)
+        raise ConfigError(f"{files[0].parent}: several files of annotations ({names}); give one of them as the data")
     report = ImportReport(str(files[0]) if len(files) == 1 else str(files[0].parent))
     for photographs in sets:
         report.extend(photographs.report)
     joined = tuple(photograph for photographs in sets for photograph in photographs.photographs)
     if not joined:
-        raise ConfigError(f"{report.source}: no photograph in the annotations")
+        raise ConfigError(f"{report.source}: no photograph in the annotations; choose another file or split")
     classes = {name for photographs in sets for name in photographs.classes}
     return PhotographSet(sets[0].form, joined, tuple(name for name in CLASSES if name in classes), report)
 
@@ -222,8 +218,8 @@ def _read_coco(path: Path, content: Any, report: ImportReport) -> PhotographSet:
     photographs = []
     for image in data.images:
         names = [
-            IGNORED if crowd and classes[label_entry] else classes[label_entry]
-            for label_entry, crowd in zip(image.label, image.crowd, strict=True)
+            IGNORED if crowd and classes[label] else classes[label]
+            for label, crowd in zip(image.label, image.crowd, strict=True)
         ]
         name = image.file.relative_to(images or image.file.parent).as_posix()
         photographs.append(_photograph(name, image.file, (image.width, image.height), names, image.box))
@@ -318,7 +314,7 @@ def _kitti_photograph(kitti_root: Path, image_file: Path, labels: Path) -> Photo
         except ValueError:
             values = []
         if len(values) < 14:
-            raise FormatError(f"{labels}, line {number}: no object of KITTI: type and 14 numbers are expected")
+            raise FormatError(f"{labels}, line {number}: no object of KITTI; give a type and 14 numbers")
         names.append(class_of(words[0]))
         boxes.append(values[3:7])
         height, width, length, x, y, z, yaw = values[7:14]
@@ -340,13 +336,13 @@ def _kitti_camera(path: Path) -> tuple[F64 | None, float]:
                 break
             if projection[0, 0] > 0 and np.isfinite(projection).all():
                 return projection[:, :3], float(projection[0, 3] / projection[0, 0])
-    raise FormatError(f"{path}: no projection P2 of twelve numbers")
+    raise FormatError(f"{path}: no projection P2 of twelve numbers; give the calib file of the photograph")
 
 
-def _read_nuscenes(kitti_root: Path, split: str) -> PhotographSet:
+def _read_nuscenes(root: Path, split: str) -> PhotographSet:
     """Read the key images of all cameras of a data set in the nuScenes schema."""
     photographs = []
-    with NuScenes(kitti_root) as data:
+    with NuScenes(root) as data:
         report = data.report()
         scenes = scenes_of(data, split) if split else tuple(scene.name for scene in data.scenes())
         for name in scenes:
@@ -367,7 +363,7 @@ def _read_nuscenes(kitti_root: Path, split: str) -> PhotographSet:
                 photographs.append(
                     Photograph(
                         frame.filename,
-                        nuscenes_path(kitti_root, frame.filename),
+                        nuscenes_path(root, frame.filename),
                         (frame.width, frame.height),
                         truth.box.double().numpy(),
                         truth.label.numpy().astype(np.int32),
@@ -388,22 +384,22 @@ def _photograph(
     solids: Iterable[Any] | None = None,
     intrinsic: F64 | None = None,
 ) -> Photograph:
-    """Return a photograph with its objects that have a class or are ignored. ValueError: a broken box."""
-    rows = [object_row for object_row, class_name in enumerate(names) if class_name]
+    """Return a photograph with its objects that have a class or are ignored. Raise ValueError for a broken box."""
+    rows = [row for row, class_name in enumerate(names) if class_name]
     box = np.array([list(entry) for entry in boxes], np.float64).reshape(-1, 4)
     solid_boxes = np.array([list(entry) for entry in solids or [NO_SOLID] * len(names)], np.float64).reshape(-1, 7)
     if len(box) != len(names) or len(solid_boxes) != len(names):
         raise ValueError(f"{name}: {len(names)} objects, {len(box)} boxes")
     if not np.isfinite(box).all() or (box[:, 2:] <= box[:, :2]).any():
         raise ValueError(f"{name}: a box without width or height, or not finite")
-    labels = [CLASSES.index(names[object_row]) if names[object_row] != IGNORED else -1 for object_row in rows]
+    labels = [CLASSES.index(names[row]) if names[row] != IGNORED else -1 for row in rows]
     return Photograph(name, image_file, size, box[rows], np.array(labels, np.int32), solid_boxes[rows], intrinsic)
 
 
 def _named_classes(photographs: Sequence[Photograph]) -> list[str]:
     """Return the classes that occur in photographs, of a form that lists none."""
-    labels = {int(label_entry) for photograph in photographs for label_entry in photograph.label if label_entry >= 0}
-    return [CLASSES[label_entry] for label_entry in sorted(labels)]
+    labels = {label for photograph in photographs for label in photograph.label.tolist() if label >= 0}
+    return [CLASSES[label] for label in sorted(labels)]
 
 
 def _of(form: Form, photographs: Sequence[Photograph], classes: Iterable[str], report: ImportReport) -> PhotographSet:

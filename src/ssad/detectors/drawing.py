@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -57,9 +59,13 @@ def draw_clear_detections(detector: Detector, image: Tensor, intrinsic: Tensor |
     ):
         top_left, bottom_right = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
         cv2.rectangle(canvas, top_left, bottom_right, FOUND, 2, cv2.LINE_AA)
-        text = f"{detector.classes[label]} {score:.2f}"
-        text_position = (top_left[0], max(top_left[1] - 4, 12))
-        # A dark outline first, so that the text is readable on any background.
-        cv2.putText(canvas, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(canvas, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
+        write_beside(canvas, f"{detector.classes[label]} {score:.2f}", box)
     return canvas
+
+
+def write_beside(canvas: U8, text: str, box: Sequence[float] | F64) -> None:
+    """Write a text above the upper left corner of a 2D box into an image, in the colour of detections."""
+    position = (round(float(box[0])), max(round(float(box[1])) - 4, 12))
+    # A dark outline first, so that the text is readable on any background.
+    cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)

@@ -1,22 +1,19 @@
 """Metrics of lane keeping: deviation from the middle of the lane, departures from it, and errors of the camera's lane.
 
-The lane is that of the route: for drives that change lanes these metrics mean nothing.
+The lane is that of the route, so these metrics are not defined for drives that change lanes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.perception import PerceivedLane
+from ssad.core.perception import LANE_CONFIDENCE, PerceivedLane
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
-
-SURE: Final = 0.7  # confidence from which on a lane counts as detected
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,7 @@ def _widths(graph: LaneGraph, points: F64) -> F64:
 
 
 def is_outside(position: PositionInLane, length: float, width: float) -> Bool:
-    """Return the steps [T] in which the ego's body reaches over a line of its lane.
+    """Return whether the ego's body crosses a line of its lane at each step [T].
 
     Args:
         position: Position in the lane.
@@ -105,15 +102,15 @@ def lane_metrics(
         trace: The drive.
         graph: Its town.
         lanes: Time, s, and the lane that the driver believed in, of its steps.
-        place: Distance along the route of what may lead it astray, m; None: nothing does.
-        view: m before that place from which on the driver has it in view.
+        place: Distance along the route to the perturbation, m; None without one.
+        view: Distance before that place at which it comes into view, m.
 
     Returns:
         lane_deviation: Mean distance to the middle of the lane, m.
         lane_deviation_max: Greatest distance, m.
         lane_departure: 1 if the body crosses a line of the lane, else 0.
-        departure_time: s from the moment when the place comes into view to the first crossing after it; NaN: none.
-        lane_error: Mean error of the believed middle of the lane beside the ego, m; NaN: it never believed in one.
+        departure_time: s from when the place comes into view to the first crossing after it; NaN without one.
+        lane_error: Mean error of the believed middle of the lane beside the ego, m; NaN if it believed in none.
         lane_seen: Share of the steps in which it detected the lane.
     """
     position = lane_position(trace, graph)
@@ -126,7 +123,7 @@ def lane_metrics(
         "lane_departure": float(len(crossings) > 0),
         "departure_time": float(crossings[0]) * trace.dt if len(crossings) else float("nan"),
     }
-    lane_errors, sure_count = [], 0
+    lane_errors, detected_count = [], 0
     for lane_time, perceived_lane in lanes:
         nearest_step = min(round(lane_time / trace.dt), len(position.deviation) - 1)
         if perceived_lane is not None:
@@ -134,9 +131,9 @@ def lane_metrics(
             lane_errors.append(
                 abs(perceived_lane.offset * np.cos(position.heading[nearest_step]) + position.deviation[nearest_step])
             )
-            sure_count += perceived_lane.confidence >= SURE
+            detected_count += perceived_lane.confidence >= LANE_CONFIDENCE
     metrics["lane_error"] = float(np.mean(lane_errors)) if lane_errors else float("nan")
-    metrics["lane_seen"] = sure_count / max(len(lanes), 1)
+    metrics["lane_seen"] = detected_count / max(len(lanes), 1)
     return metrics
 
 

@@ -32,7 +32,7 @@ class HeightBand:
 
     @property
     def title(self) -> str:
-        """The range in words."""
+        """Range in words."""
         return f"{self.low:g} px and more" if np.isinf(self.high) else f"{self.low:g} to {self.high:g} px"
 
     def holds(self, box: F64) -> Bool:
@@ -164,7 +164,7 @@ def photograph_scores(
         intervals.
     """
     draws = generator("photograph scores", seed).integers(images, size=(replicates, images))
-    weights = [np.bincount(draw_weights, minlength=images) for draw_weights in draws]
+    weights = [np.bincount(draw, minlength=images) for draw in draws]
     everything = HeightBand(min((band.low for band in bands), default=0.0))
 
     def counts_of(band: HeightBand) -> BoxCounts:
@@ -193,7 +193,7 @@ def photograph_scores(
 def _figures(counts: BoxCounts, weights: Sequence[I64], images: int) -> dict[str, Any]:
     """Return metrics, intervals and n of some counts."""
     values = counts.measures(np.ones(images, np.int64))
-    resampled = [counts.measures(draw_weights) for draw_weights in weights]
+    resampled = [counts.measures(image_weights) for image_weights in weights]
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float]] = {}
     for name, value in values.items():
@@ -201,7 +201,7 @@ def _figures(counts: BoxCounts, weights: Sequence[I64], images: int) -> dict[str
         # A margin is a mean score, which lies in [0, 1], less the threshold.
         offset = counts.threshold if name == "margin" else 0.0
         estimate = replicate_estimate(
-            value + offset, [draw_weights[name] + offset for draw_weights in resampled], n=images, clusters=images
+            value + offset, [measures[name] + offset for measures in resampled], n=images, clusters=images
         )
         if not np.isnan(estimate.low):
             intervals[name] = [round(estimate.low - offset, DIGITS), round(estimate.high - offset, DIGITS)]
@@ -223,7 +223,7 @@ def worn_scores(
 
     Returns:
         metrics: found (share of the cars), score (mean), change (of the mean score), hidden (share of the cars found
-        without the texture that are not with it); intervals; n.
+        without the texture that are missed with it); intervals; n.
     """
     values = _worn_measures(clean, worn, threshold)
     groups = [np.flatnonzero(image == number) for number in np.unique(image)]
@@ -240,7 +240,7 @@ def worn_scores(
         metrics[name] = None if np.isnan(value) else round(value, DIGITS)
         # A change lies in [-1, 1]: its half plus one half is a share.
         scale, offset = (0.5, 0.5) if name == "change" else (1.0, 0.0)
-        draws = [scale * draw_weights[name] + offset for draw_weights in resampled]
+        draws = [scale * measures[name] + offset for measures in resampled]
         estimate: Estimate = replicate_estimate(scale * value + offset, draws, n=len(clean), clusters=len(groups))
         if not np.isnan(estimate.low):
             limits = ((estimate.low - offset) / scale, (estimate.high - offset) / scale)

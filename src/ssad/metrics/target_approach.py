@@ -1,4 +1,4 @@
-"""A target on the way to it: detection against distance, where it is first detected, and where a vehicle can stop."""
+"""Approach to a target: detection against distance, the first detection, and the stopping distance of a vehicle."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def axis_of(distances: Sequence[float], clean_precisions: Sequence[float | None]
 
 
 def first_detection(distances: Sequence[float], shares: Sequence[float]) -> float:
-    """Return the distance at which an approaching camera first detects the target, m; 0: nowhere.
+    """Return the distance at which an approaching camera first detects the target, m; 0 if it never does.
 
-    Coming from far it is the first at which the target is found in `FOUND_SHARE` of the images, interpolated linearly
-    between two distances; the farthest one if it is found there.
+    Coming from far, it is the first distance at which the target is found in `FOUND_SHARE` of the images, interpolated
+    linearly between two distances; the farthest one if it is found there.
 
     Args:
         distances: From near to far, m.

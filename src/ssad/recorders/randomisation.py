@@ -1,8 +1,8 @@
 """Randomisation of recordings: paint and dirt of vehicles, cameras, their colours, noise and compression.
 
-Detectors that saw one camera and clean cars fail on others (Tobin et al. 2017, "Domain randomization for transferring
-deep neural networks from simulation to the real world"). Each dimension has a name, can be switched off, and is drawn
-from the seed of the recording alone; what was drawn is part of the dataset.
+Training on varied images helps detectors on cameras and cars that they were not trained on (Tobin et al. 2017, "Domain
+randomization for transferring deep neural networks from simulation to the real world"). Each dimension has a name, can
+be switched off, and is drawn from the seed of the recording alone. The dataset contains the drawn values.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Dimension:
         summary: Phrase that says what is drawn.
         low: Least value by default.
         high: Largest value by default.
-        bounds: Least and largest value that can be asked for.
-        scale: Distribution between both: uniform, or uniform in the logarithm.
-        subject: What each draw is for: a vehicle, or a camera in a scene (with `--clips`: an image).
+        bounds: Least and largest value that a range may have.
+        scale: Distribution over the range: uniform, or uniform in the logarithm.
+        subject: Subject of each draw: a vehicle, or a camera in a scene (with `--clips`: an image).
     """
 
     name: str
@@ -109,7 +109,7 @@ DIMENSIONS: Final[Mapping[str, Dimension]] = {
         Dimension("compression", "quality of JPEG", 60.0, 96.0, (5.0, 100.0)),
     )
 }
-PAINTED: Final = "car"  # kind of body whose paint is drawn by the shares
+PAINT_KIND: Final = "car"  # kind of body whose paint is drawn by the shares
 VEHICLES: Final = ("car", "truck", "bus", "trailer", "construction", "motorcycle")
 WAVELENGTHS: Final = (600.0, 540.0, 450.0)  # nm, of red, green and blue
 RADIATION: Final = 1.4388e7  # nm K, second radiation constant
@@ -201,7 +201,7 @@ class Randomisation:
 
     Raises:
         UnknownNameError: There is no such dimension.
-        ConfigError: A range is not one, or goes beyond the bounds of its dimension.
+        ConfigError: A range is reversed, or goes beyond the bounds of its dimension.
     """
 
     ranges: tuple[tuple[str, float, float], ...] = ()
@@ -210,10 +210,11 @@ class Randomisation:
         for name, low, high in self.ranges:
             if name not in DIMENSIONS:
                 raise unknown_name("dimension", name, DIMENSIONS)
-            least, most = DIMENSIONS[name].bounds
-            if not least <= low <= high <= most:
+            lower_bound, upper_bound = DIMENSIONS[name].bounds
+            if not lower_bound <= low <= high <= upper_bound:
                 raise ConfigError(
-                    f"randomisation: {name} from {low:g} to {high:g}; give a range within {least:g} to {most:g}"
+                    f"randomisation: {name} from {low:g} to {high:g}; give a range within {lower_bound:g} to "
+                    f"{upper_bound:g}"
                 )
 
     def __bool__(self) -> bool:
@@ -256,7 +257,7 @@ class Randomisation:
         if body.kind not in VEHICLES:
             return body
         values = self._draw("vehicle", key)
-        if "paint" in values and body.kind == PAINTED and has_paint:
+        if "paint" in values and body.kind == PAINT_KIND and has_paint:
             body = replace(body, paint=_draw_colour(values["paint"], key))
         amounts = {name: values[name] for name in ("metallic", "dirt", "wear") if name in values}
         if not amounts:
@@ -295,13 +296,15 @@ def describe_body(body: ObjectBody) -> dict[str, Any]:
     return {"paint": [round(value, 5) for value in body.paint]} | finish
 
 
-def _draw_colour(spread: float, key: tuple[object, ...]) -> tuple[float, float, float]:
+def _draw_colour(deviation: float, key: tuple[object, ...]) -> tuple[float, float, float]:
     """Draw a paint (linear RGB) by `COLOUR_SHARES`."""
     rng = generator("randomise colour", *key)
     shares = np.array(list(COLOUR_SHARES.values()), float)
     paints = COLOUR_PAINTS[str(rng.choice(list(COLOUR_SHARES), p=shares / shares.sum()))]
     paint = np.array(PAINTS[paints[int(rng.integers(len(paints)))]])
-    red, green, blue = np.minimum(paint * np.exp(spread * rng.normal(size=1) + 0.3 * spread * rng.normal(size=3)), 0.88)
+    red, green, blue = np.minimum(
+        paint * np.exp(deviation * rng.normal(size=1) + 0.3 * deviation * rng.normal(size=3)), 0.88
+    )
     return float(red), float(green), float(blue)
 
 

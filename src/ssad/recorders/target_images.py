@@ -153,7 +153,7 @@ def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> 
 
 
 def _surrounding(stage_set: _TargetDrive, viewpoint: Viewpoint) -> list[PlacedObject]:
-    """Objects around the camera; on an approach without those between it and the target."""
+    """Return the objects around the camera; on an approach, without those between it and the target."""
     placed_objects = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
     if not stage_set.recording.approach:
         return placed_objects
@@ -251,7 +251,7 @@ def _viewpoint_rounds(
 def _approaching_rounds(
     stage_set: _TargetDrive, town: str, slots: range, missing: Callable[[], list[int]], rng: np.random.Generator
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
-    """Again and again shots for what is missing, each from its own distance, until this drive has no more."""
+    """Yield rounds of shots for missing images, each at its own distance, until the drive has no more."""
     recording = stage_set.recording
     weather = draw_weather(("clips", *stage_set.key))
     distance_indices = shuffled_cells(slots, len(recording.approach), key=(recording.seed, town))
@@ -280,7 +280,7 @@ def _approaching_rounds(
 def _visible_viewpoints(
     stage_set: _TargetDrive, viewpoints: Sequence[Viewpoint], distance: float
 ) -> Iterator[Viewpoint]:
-    """Those viewpoints of an approach from which the street does not hide the target, described by their distance."""
+    """Yield the viewpoints of an approach from which the street does not hide the target, with their distance."""
     for viewpoint in viewpoints:
         if viewpoint.description["distance"] < STRAIGHT * distance:
             continue  # behind a bend

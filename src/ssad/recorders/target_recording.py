@@ -114,9 +114,10 @@ class TargetRecording:
         if is_sign and self.elevations != (0.0,):
             raise ConfigError("a sign is seen from the heights of cars: give no elevations")
         if self.approach and self.mode != "drive":
-            raise ConfigError("approach is for a camera that follows; an orbit has distances")
+            raise ConfigError("approach: it needs a camera that follows the target; give distances for an orbit")
         if not all(3.0 <= distance <= MAX_DISTANCE for distance in self.approach):
-            raise ConfigError(f"approach: 3 to {MAX_DISTANCE:g} m")
+            values = ", ".join(f"{distance:g}" for distance in self.approach)
+            raise ConfigError(f"approach: {values} m; give distances from 3 to {MAX_DISTANCE:g} m")
         max_distance = max(self.approach or (self.behind,)) if self.mode == "drive" else max(self.distances)
         target_kind = "sign" if is_sign else "walker" if is_walker else "car"
         # The smallest side of the farthest target must still span MIN_BOX_SIDE pixels.
@@ -150,7 +151,7 @@ class TargetRecording:
 
 
 def height_in_pixels(metres: float, distance: float, size: int) -> float:
-    """Return the height in the image of something upright, px, seen level by a pinhole camera.
+    """Return the height of an upright object in the image of a level pinhole camera, px.
 
     Args:
         metres: Its height, m.

@@ -41,7 +41,7 @@ def lens_emission(state: SignalState) -> float:
     """Return the emission of a lit lens in an image.
 
     Its luminance is that of `LENS_CANDELA` on the scale of noon. The renderer compresses the range of daylight, so at
-    night the lens is darker than its published luminance: its colour does not drown in the sensor.
+    night the lens is darker than its published luminance, and the sensor does not clip its colour.
     """
     luminance = LENS_CANDELA / (np.pi * LENS**2)
     # A white surface has the luminance of its illuminance over pi.
@@ -59,7 +59,7 @@ def lit_lens(state: SignalState) -> Mesh:
     return _disc(LENS, (0.0, 0.01), material)
 
 
-def walker_head(shown: str) -> Mesh:
+def walker_head(state: str) -> Mesh:
     """Return a post with the signal for walkers that faces along x, in one of its states."""
     black = Material("black_plastic", (0.02, 0.02, 0.022), gloss=0.4)
     metal = Material("galvanised", (0.36, 0.37, 0.38), specular=0.3, gloss=0.5)
@@ -67,16 +67,16 @@ def walker_head(shown: str) -> Mesh:
         tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.5]]), 0.05, material=metal, segments=6),
         box((0.16, 0.26, 0.52), material=black, centre=(0.13, 0.0, 2.2)),
     ]
-    for name, (height, state) in WALKER_LENSES.items():
-        lit = Material("signal_light", LIGHTS[state], emission=lens_emission(state))
-        unlit = Material(f"signal_{state.name.lower()}", UNLIT_LENS[state], gloss=0.6)
-        parts.append(_disc(WALKER_LENS, (0.21, 0.22), lit if name == shown else unlit).moved(0.0, 0.0, height))
+    for name, (height, colour) in WALKER_LENSES.items():
+        bright = Material("signal_light", LIGHTS[colour], emission=lens_emission(colour))
+        dark = Material(f"signal_{colour.name.lower()}", UNLIT_LENS[colour], gloss=0.6)
+        parts.append(_disc(WALKER_LENS, (0.21, 0.22), bright if name == state else dark).moved(0.0, 0.0, height))
     return merge(parts)
 
 
 def head_meshes() -> tuple[Mesh, ...]:
     """Return the meshes that `SignalHeads` places: a lit lens of each state, then heads for walkers."""
-    return (*(lit_lens(state) for state in LENSES), *(walker_head(shown) for shown in (DARK, STOP, WALK)))
+    return (*(lit_lens(state) for state in LENSES), *(walker_head(state) for state in (DARK, STOP, WALK)))
 
 
 class SignalHeads:
@@ -109,8 +109,8 @@ class SignalHeads:
         places = []
         for signals, pose in walker_head_poses(graph):
             heads = {
-                shown: SceneObject(first_mesh + len(LENSES) + index, pose, effect="walker-signals")
-                for index, shown in enumerate((DARK, STOP, WALK))
+                state: SceneObject(first_mesh + len(LENSES) + index, pose, effect="walker-signals")
+                for index, state in enumerate((DARK, STOP, WALK))
             }
             self._walker_heads.append((signals, heads))
             places.append(pose[:2, 3])
@@ -124,12 +124,12 @@ class SignalHeads:
             viewpoint: x, y, m.
         """
         visible = []
-        for head in _near(self._places, viewpoint):
+        for head in _nearby(self._places, viewpoint):
             lenses = self._lenses[head]
             state = SignalState(states.get(self._signals[head], SignalState.OFF))
             if state in lenses:
                 visible.append(lenses[state])
-        for head in _near(self._walker_places, viewpoint):
+        for head in _nearby(self._walker_places, viewpoint):
             signals, heads = self._walker_heads[head]
             visible.append(heads[walker_state([states.get(signal, SignalState.OFF) for signal in signals])])
         return tuple(visible)
@@ -142,7 +142,7 @@ class SignalHeads:
 
 
 def walker_state(states: list[int]) -> str:
-    """Return what walkers are shown where they cross traffic with signals in some states.
+    """Return the state of a signal for walkers who cross traffic with signals in some states.
 
     They may walk while all of that traffic has red; where one of the signals is off, theirs is dark.
     """
@@ -172,7 +172,7 @@ def walker_head_poses(graph: LaneGraph) -> list[tuple[tuple[int, ...], F64]]:
     return heads
 
 
-def _near(places: F64, viewpoint: F64) -> list[int]:
+def _nearby(places: F64, viewpoint: F64) -> list[int]:
     offsets = places - viewpoint
-    near: list[int] = np.flatnonzero(np.hypot(offsets[:, 0], offsets[:, 1]) < SIGNALS_WITHIN).tolist()
-    return near
+    nearby: list[int] = np.flatnonzero(np.hypot(offsets[:, 0], offsets[:, 1]) < SIGNALS_WITHIN).tolist()
+    return nearby

@@ -1,6 +1,6 @@
 """Edits of the street in the closed loop that stay in their place: textures on the road, lamps, bodies and signs.
 
-An edit moves nothing in the world: contacts, traffic and the map stay as they are, and only sensors are told.
+An edit changes what sensors see. Contacts, traffic and the map stay as they are.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class StreetEdit:
         place: Distance along the route and offset to the left of it, m.
         bodies: Bodies with their poses [4, 4] in the frame of the place.
         signs: Kind of the town's signs (`ssad.rendering.street_signs.KINDS`) -> body that stands in place of each of
-            them; None: it is gone.
+            them; None removes them.
         head_lamps: Lamps that shine on every signal head, in its frame (x away from its face); powers in lumen.
 
     Raises:
@@ -48,12 +48,14 @@ class StreetEdit:
 
     def __post_init__(self) -> None:
         if self.edit.layers or self.edit.cards:
-            raise ConfigError("an edit of the street has no layers and no cards: they need a target")
+            raise ConfigError("edit of the street: layers and cards need a target; use decals and lamps")
         if not np.isfinite(self.place).all() or self.place[0] < 0.0:
-            raise ConfigError(f"the place of an edit of the street is {self.place}: a distance from 0, and an offset")
+            raise ConfigError(
+                f"edit of the street: place {self.place}; give a distance along the route from 0, and an offset, in m"
+            )
 
     def meshes(self) -> dict[Any, Mesh]:
-        """Return the meshes that the scene must hold, by their own names."""
+        """Return the meshes that the scene must hold, by name."""
         named: dict[Any, Mesh] = {("street edit", id(self), index): body for index, (body, _) in enumerate(self.bodies)}
         replacements = {kind: mesh for kind, mesh in self.signs.items() if mesh is not None}
         return named | {("street edit sign", id(self), kind): mesh for kind, mesh in replacements.items()}

@@ -1,4 +1,4 @@
-"""Stop lamps and indicators of vehicles, from what a trace says of their motion and their turn signals."""
+"""Stop lamps and indicators of vehicles, from their motion and their turn signals in a trace."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MO
 STOP_DECELERATION: Final = 0.7  # m/s^2 above which stop lamps may shine (UN Regulation No. 13-H, 5.2.22)
 STANDSTILL: Final = 0.1  # m/s below which the foot is on the brake
 FLASH_RATE: Final = 1.5  # Hz, of indicators (UN Regulation No. 6: 60 to 120 a minute)
-PHASE: Final = 0.382  # of a period from one agent to the next: indicators do not flash in step
+PHASE: Final = 0.382  # period's share between two agents, so that indicators do not flash in step
 
 
 def vehicle_signals(  # noqa: PLR0917
@@ -34,9 +34,9 @@ def vehicle_signals(  # noqa: PLR0917
         dt: Time of a step, s.
         has_lamps: Whether the agent has such lamps.
     """
-    slowing = np.abs(previous_speed) - np.abs(speed) > STOP_DECELERATION * dt
-    standing = (np.abs(speed) < STANDSTILL) & (walked > 0.0)
-    bits = np.where(slowing | standing, int(LampSignal.BRAKE), 0)
+    is_slowing = np.abs(previous_speed) - np.abs(speed) > STOP_DECELERATION * dt
+    is_standing = (np.abs(speed) < STANDSTILL) & (walked > 0.0)
+    bits = np.where(is_slowing | is_standing, int(LampSignal.BRAKE), 0)
     bits |= np.where(turn == TurnSignal.LEFT, int(LampSignal.LEFT), 0)
     bits |= np.where(turn == TurnSignal.RIGHT, int(LampSignal.RIGHT), 0)
     signals: U8 = np.where(has_lamps, bits, 0).astype(np.uint8)
@@ -67,5 +67,5 @@ def flashing(signals: npt.ArrayLike, time: float, agents: npt.ArrayLike) -> npt.
         agents: Numbers of the agents, which decide the phase; of the shape of `signals`.
     """
     is_bright = (time * FLASH_RATE + np.asarray(agents) * PHASE) % 1.0 < 0.5
-    visible = np.where(is_bright, ~0, int(LampSignal.BRAKE))
-    return np.asarray(np.asarray(signals, np.int32) & visible, np.int32)
+    visible_bits = np.where(is_bright, ~0, int(LampSignal.BRAKE))
+    return np.asarray(np.asarray(signals, np.int32) & visible_bits, np.int32)

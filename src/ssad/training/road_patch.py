@@ -1,9 +1,9 @@
 """Training of a dirty road patch against the lane keeper, through a differentiable copy of its loop.
 
 The copy renders the road from above (lines, asphalt and patch as the camera resolves them), detects and filters the
-lane as `ssad.drivers.lane_keeping` does, and drives a kinematic bicycle with its pure pursuit. All of it is
-differentiable, so that the deviation after the patch has a gradient with respect to each of its texels, as in the
-motion model of Sato et al. (USENIX Security 2021).
+lane as `ssad.drivers.lane_keeping` does, and drives a kinematic bicycle with its pure pursuit. So the deviation
+after the patch has a gradient with respect to each of its texels, as in the motion model of Sato et al. (USENIX
+Security 2021).
 
     python -m ssad.training.road_patch --out patch
 """
@@ -24,15 +24,16 @@ from ssad.core.seeding import generator
 from ssad.drivers.lane_keeping.control import PREVIEW
 from ssad.drivers.lane_keeping.lane import CHANGE, FITS, FULL_WEIGHT, INITIAL, NOISE, NOISE_STEP, STEP
 from ssad.drivers.lane_keeping.markings import CONTRAST, FULL_CONTRAST, SIDE, RoadGrid
-from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, CELL, DIRT, LENGTH, WIDE
+from ssad.rendering.camera.texture import to_srgb
+from ssad.scenarios.static.physical.street.dirty_road import ASPHALT_ALBEDO, CELL, COVERING_WIDTH, DIRT, LENGTH
 from ssad.scenarios.static.physical.textures.card import TextureCard, save_texture
 
 LINE_ALBEDO = 0.72
 LINE_WIDTH = 0.12  # m
 DASH, PERIOD = 3.0, 9.0  # m
 EXPOSURE = 0.78  # code value over albedo, both linear
-FOOTPRINT = 1.0 / 764.0  # 1/m: a pixel row covers so much times the square of the distance, m
-ENOUGH = 2.5  # m
+FOOTPRINT = 1.0 / 764.0  # 1/m: length of the road in a pixel row over the square of its distance
+MAX_GAIN = 2.5  # m of deviation beyond which more earns nothing: the lane is left in any case
 COARSE = RoadGrid(half_width=4.0, row_step=1.0)
 LANE_WIDTH = 3.5  # m
 LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
@@ -40,14 +41,14 @@ LATENCY = 0.35  # s with which the wheels follow, as a lag of first order
 
 @dataclass(frozen=True, slots=True)
 class RoadApproach:
-    """A drive over a straight road towards the patch.
+    """Drive over a straight road towards the patch.
 
     Attributes:
         speed: m/s.
         offset: Place of the ego at the start, m to the left of the middle of the lane.
         width: Width of the lane, m.
         phase: m by which the dashes of the left line are shifted.
-        solid: Whether the left line is solid.
+        is_solid: Whether the left line is solid.
         gain: Brightness, 1 for that of noon.
     """
 
@@ -55,13 +56,8 @@ class RoadApproach:
     offset: float
     width: float
     phase: float
-    solid: bool
+    is_solid: bool
     gain: float
-
-
-def to_srgb(albedo: Tensor) -> Tensor:
-    """Convert linear values in 0 to 1 to sRGB: the inverse of `ssad.rendering.camera.texture.to_linear`."""
-    return torch.where(albedo <= 0.0031308, 12.92 * albedo, 1.055 * albedo.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def draw_approaches(count: int, *, key: tuple[object, ...]) -> list[RoadApproach]:
@@ -89,12 +85,12 @@ def road_brightness(patch: Tensor, grid: RoadGrid, approach: RoadApproach, pose:
         approach: The drive.
         pose: Ego's x, y and yaw on the road [3]; y = 0 is the middle of the lane.
     """
-    ahead, lateral = (torch.from_numpy(values).float() for values in (grid.ahead, grid.lateral))
+    ahead, lateral = (torch.from_numpy(values).float() for values in (grid.row_distance, grid.column_offset))
     albedo_sum = torch.zeros(len(ahead), len(lateral))
     patch_width = patch.shape[1] * CELL[1]
     footprint_shares = (-0.35, 0.0, 0.35)
     for footprint_share in footprint_shares:
-        # A pixel averages over its footprint along the ground_albedo.
+        # A pixel averages over its footprint along the road.
         distance_ahead = (ahead + footprint_share * FOOTPRINT * ahead**2)[:, None]
         place_along = pose[0] + distance_ahead * torch.cos(pose[2]) - lateral * torch.sin(pose[2])
         place_across = pose[1] + distance_ahead * torch.sin(pose[2]) + lateral * torch.cos(pose[2])
@@ -105,7 +101,7 @@ def road_brightness(patch: Tensor, grid: RoadGrid, approach: RoadApproach, pose:
         left_line = (
             (0.5 * LINE_WIDTH + line_blur - (place_across - 0.5 * approach.width).abs()) / (2.0 * line_blur)
         ).clamp(0.0, 1.0)
-        if not approach.solid:
+        if not approach.is_solid:
             left_line = left_line * (((place_along + approach.phase) % PERIOD) < DASH)
         texture_column, texture_row = -2.0 * place_across / patch_width, -2.0 * place_along / LENGTH
         patch_albedo = functional.grid_sample(
@@ -117,7 +113,7 @@ def road_brightness(patch: Tensor, grid: RoadGrid, approach: RoadApproach, pose:
         is_patch = (texture_column.abs() < 1.0) & (texture_row.abs() < 1.0)
         ground_albedo = torch.where(is_patch, patch_albedo, torch.full_like(patch_albedo, ASPHALT_ALBEDO))
         line_share = (left_line + right_line).clamp(0.0, 1.0)
-        line_share = torch.where(is_patch, torch.zeros_like(line_share), line_share)  # patch_albedo covers lines
+        line_share = torch.where(is_patch, torch.zeros_like(line_share), line_share)  # the patch covers lines
         albedo_sum = albedo_sum + ground_albedo * (1.0 - line_share) + LINE_ALBEDO * line_share
     return 255.0 * to_srgb((albedo_sum / len(footprint_shares) * EXPOSURE * approach.gain).clamp(1e-4, 1.0))
 
@@ -145,20 +141,20 @@ class LaneModel:
         self.grid = grid
         self.state = torch.tensor([offset, 0.0, 0.0, width], dtype=torch.float32)
         self.covariance = torch.diag(torch.tensor(INITIAL).square())
-        ahead = torch.from_numpy(grid.ahead).float()
+        ahead = torch.from_numpy(grid.row_distance).float()
         ones = torch.ones_like(ahead)
         left = torch.stack([ones, ahead, 0.5 * ahead**2, 0.5 * ones], 1)
         self._designs = (left, left * torch.tensor([1.0, 1.0, 1.0, -1.0]))
         self._row_weight = (FULL_WEIGHT / ahead).clamp(max=1.0).square() * grid.row_step / NOISE_STEP
-        self._ahead, self._lateral = ahead, torch.from_numpy(grid.lateral).float()
+        self._ahead, self._lateral = ahead, torch.from_numpy(grid.column_offset).float()
 
     def predict(self, forward: Tensor, turn: Tensor) -> None:
         """Move the lane by the motion of the ego in a step."""
-        zero, one = torch.zeros(()), torch.ones(())
+        zero, unit = torch.zeros(()), torch.ones(())
         motion = torch.stack(
             [
-                torch.stack([one, forward, 0.5 * forward**2, zero]),
-                torch.stack([zero, one, forward, zero]),
+                torch.stack([unit, forward, 0.5 * forward**2, zero]),
+                torch.stack([zero, unit, forward, zero]),
                 torch.tensor([0.0, 0.0, 1.0, 0.0]),
                 torch.tensor([0.0, 0.0, 0.0, 1.0]),
             ]
@@ -206,10 +202,10 @@ def deviation(patch: Tensor, approach: RoadApproach, grid: RoadGrid, *, seconds:
         if step:
             lane.predict(speed * STEP, turn)
         lane.correct(marking_strength(road_brightness(patch, grid, approach, pose), grid))
-        ahead = PREVIEW[0] + PREVIEW[1] * speed
-        lateral = lane.state[0] + lane.state[1] * ahead + 0.5 * lane.state[2] * ahead**2
-        wanted = 2.0 * lateral / (ahead**2 + lateral**2)
-        curvature = curvature + (wanted - curvature) * (1.0 - np.exp(-STEP / LATENCY))
+        distance = PREVIEW[0] + PREVIEW[1] * speed
+        lateral = lane.state[0] + lane.state[1] * distance + 0.5 * lane.state[2] * distance**2
+        target_curvature = 2.0 * lateral / (distance**2 + lateral**2)
+        curvature = curvature + (target_curvature - curvature) * (1.0 - np.exp(-STEP / LATENCY))
         turn = curvature * speed * STEP
         middle = pose[2] + 0.5 * turn
         move = torch.stack([speed * STEP * torch.cos(middle), speed * STEP * torch.sin(middle), turn])
@@ -240,7 +236,7 @@ def start_patch(width: float, *, shift: float, seed: int) -> Tensor:
 
 def train_road_patch(
     *,
-    width: float = WIDE,
+    width: float = COVERING_WIDTH,
     steps: int = 40,
     batch: int = 2,
     rate: float = 0.04,
@@ -269,8 +265,8 @@ def train_road_patch(
     for step in range(steps):
         patch = DIRT[0] + (DIRT[1] - DIRT[0]) * share
         places = [deviation(patch, approach, grid) for approach in draw_approaches(batch, key=(seed, step))]
-        # The mean over the way rewards an early deviation; beyond `ENOUGH` the lane is left in any case.
-        gain = torch.stack([(side * (0.5 * drive[-1] + 0.5 * drive.mean())).clamp(max=ENOUGH) for drive in places])
+        # The mean over the drive rewards an early deviation.
+        gain = torch.stack([(side * (0.5 * drive[-1] + 0.5 * drive.mean())).clamp(max=MAX_GAIN) for drive in places])
         loss = stealth * (patch - ASPHALT_ALBEDO).abs().mean() - gain.mean()
         optimiser.zero_grad()
         torch.autograd.backward(loss)
@@ -289,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train a patch and write its card."""
     parser = argparse.ArgumentParser(description="Train a dirty road patch against the lane keeper.")
     parser.add_argument("--out", required=True, help="path of the card and the picture, without a suffix")
-    parser.add_argument("--width", type=float, default=WIDE, help="m across the road")
+    parser.add_argument("--width", type=float, default=COVERING_WIDTH, help="m across the road")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)

@@ -14,7 +14,7 @@ from ssad.core.types import AgentKind, SignalState
 from ssad.drivers.lane_keeping.control import (
     COMFORT,
     HEADWAY,
-    LATERAL,
+    LATERAL_ACCELERATION,
     STANDSTILL,
     bend_speed,
     following_acceleration,
@@ -57,7 +57,7 @@ def test_steering_turns_the_bicycle_along_the_curvature() -> None:
 
 
 def test_the_speed_in_a_bend_takes_the_stated_lateral_acceleration() -> None:
-    assert bend_speed(PerceivedLane(0.0, 0.0, -0.025, 3.5, 1.0)) ** 2 * 0.025 == pytest.approx(LATERAL)
+    assert bend_speed(PerceivedLane(0.0, 0.0, -0.025, 3.5, 1.0)) ** 2 * 0.025 == pytest.approx(LATERAL_ACCELERATION)
 
 
 def test_it_keeps_its_gap_and_ignores_other_lanes() -> None:

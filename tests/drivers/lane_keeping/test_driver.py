@@ -108,7 +108,7 @@ def test_what_it_reads_and_refuses() -> None:
     assert driver.sensors[-1] == CHANNEL
     assert driver.cameras[CHANNEL] is CAMERA
     assert not hasattr(driver, "believe")
-    assert RoadMap(CAMERA, GRID).pixels[0].shape == (len(GRID.ahead), len(GRID.lateral))
+    assert RoadMap(CAMERA, GRID).pixels[0].shape == (len(GRID.row_distance), len(GRID.column_offset))
     assert LaneEvent(0, 0.0, None, np.zeros((3, 1, 1), np.uint8)).lane is None
-    with pytest.raises(ConfigError, match="a lane keeper plans itself"):
+    with pytest.raises(ConfigError, match="a lane keeper plans its own motion"):
         LaneKeeper(planner=AutopilotPlanner())

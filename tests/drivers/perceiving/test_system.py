@@ -27,7 +27,7 @@ def test_a_lane_keeper_is_chosen_by_one_key_that_others_do_not_show() -> None:
 
 def test_a_lane_keeper_plans_itself() -> None:
     system = PerceivingSystem(name="s", detector="truth", steers_by="markings", planner="autopilot")
-    with pytest.raises(ConfigError, match="the lane keeper plans; remove planner"):
+    with pytest.raises(ConfigError, match="steers_by: markings has no planner; remove"):
         system.check()
 
 

@@ -75,7 +75,7 @@ def _logits_of(graph: GraphFile) -> str:
 
 
 def _features_of(graph: GraphFile, logits: str) -> str:
-    """Return the map that the last convolutions before the heat maps take."""
+    """Return the input of the last convolutions before the heat maps."""
     name = logits
     while (graph_node := graph.nodes.get(name)) is not None and graph_node.op in CONVOLUTIONS and graph_node.inputs:
         name = graph_node.inputs[0]
@@ -160,7 +160,7 @@ class CenterNet(Adapter):
         (heat_maps,) = dense.maps["heat"]
         is_peak = heat_maps == functional.max_pool2d(heat_maps, 3, 1, 1)
         score = self._by_place(torch.where(is_peak, heat_maps.sigmoid(), 0.0), len(dense.logit))
-        # A box that learned no order of its sides would be no box.
+        # Nothing in the network orders the sides of a box.
         object_box = torch.cat(
             (dense.box[..., :2].minimum(dense.box[..., 2:]), dense.box[..., :2].maximum(dense.box[..., 2:])), -1
         )
@@ -256,8 +256,8 @@ def tile_corners(size: tuple[int, int], tiles: int | None) -> tuple[list[tuple[i
             sides.
     """
     short, long = min(size), max(size)
-    centre_count = tiles or (1 if short == long else math.ceil(TILES_PER_RATIO * long / short))
-    if centre_count == 1:
+    tile_count = tiles or (1 if short == long else math.ceil(TILES_PER_RATIO * long / short))
+    if tile_count == 1:
         return [(0, 0)], long
-    starts = [round(cell_offset * (long - short) / (centre_count - 1)) for cell_offset in range(centre_count)]
+    starts = [round(number * (long - short) / (tile_count - 1)) for number in range(tile_count)]
     return [(start, 0) if size[1] >= size[0] else (0, start) for start in starts], short

@@ -37,7 +37,7 @@ CHANNEL_AXES: Final = {0: 0, 1: 2, 2: 3, 3: 1, -1: 1, -2: 3, -3: 2}
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One operation of a graph.
+    """Operation of a graph.
 
     Attributes:
         name: Name of its output.

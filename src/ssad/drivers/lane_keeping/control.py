@@ -10,16 +10,16 @@ from ssad.core.driving import Belief, Observation
 from ssad.core.perception import PerceivedLane
 from ssad.core.types import F64, AgentKind, SignalState
 
-PREVIEW: Final = (4.0, 0.45)  # m, s: the pursued point lies so far ahead, plus the way of so much time
-LATERAL: Final = 2.5  # m/s^2, lateral acceleration in bends
-PULL: Final = 1.5  # m/s^2, highest acceleration
-COMFORT: Final = 2.0  # m/s^2, comfortable braking
-HARDEST: Final = 8.0  # m/s^2, braking for an obstacle
+PREVIEW: Final = (4.0, 0.45)  # m and s: constant part and time gap of the distance to the pursued point
+LATERAL_ACCELERATION: Final = 2.5  # m/s^2, in bends
+MAX_ACCELERATION: Final = 1.5  # m/s^2
+COMFORT: Final = 2.0  # m/s^2, comfortable deceleration
+MAX_DECELERATION: Final = 8.0  # m/s^2, for an obstacle
 HEADWAY: Final = 1.5  # s to the vehicle in front
 STANDSTILL: Final = 3.0  # m to the vehicle in front at rest
 RESPONSE: Final = 0.8  # s, time constant with which the speed follows
-PATH: Final = 0.3  # m between the body of the ego and what does not lie in its path
-REACH: Final = 80.0  # m ahead
+PATH_MARGIN: Final = 0.3  # m to either side of the ego's body that belong to its path
+REACH: Final = 80.0  # m ahead within which objects and stop lines count
 
 
 def pursuit_curvature(lane: PerceivedLane, speed: float) -> float:
@@ -27,9 +27,9 @@ def pursuit_curvature(lane: PerceivedLane, speed: float) -> float:
 
     Pure pursuit (Coulter, CMU-RI-TR-92-01, 1992). On a circular lane it is the curvature of the lane.
     """
-    ahead = PREVIEW[0] + PREVIEW[1] * max(speed, 0.0)
-    lateral = lane.middle(ahead)
-    return 2.0 * lateral / (ahead * ahead + lateral * lateral)
+    distance = PREVIEW[0] + PREVIEW[1] * max(speed, 0.0)
+    lateral = lane.middle(distance)
+    return 2.0 * lateral / (distance * distance + lateral * lateral)
 
 
 def steer_for(curvature: float, wheelbase: float, lock: float) -> float:
@@ -47,19 +47,19 @@ def steer_for(curvature: float, wheelbase: float, lock: float) -> float:
 
 
 def bend_speed(lane: PerceivedLane) -> float:
-    """Return the speed at which the bend of a lane takes `LATERAL`, m/s."""
-    return float(np.sqrt(LATERAL / max(abs(lane.curvature), 1e-4)))
+    """Return the speed at which the bend of a lane takes `LATERAL_ACCELERATION`, m/s."""
+    return float(np.sqrt(LATERAL_ACCELERATION / max(abs(lane.curvature), 1e-4)))
 
 
 def following_acceleration(view: Observation, belief: Belief, row: int, lane: PerceivedLane, size: F64) -> float:
     """Return the acceleration that keeps the distance to the nearest believed object in the lane, m/s^2.
 
-    That of the Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000), without its term for the free road.
+    It is the interaction term of the Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000).
 
     Args:
         view: Observation.
         belief: Believed objects.
-        row: Row of both.
+        row: Row of the ego in both.
         lane: The lane that the ego keeps.
         size: Length and width of the ego, m.
 
@@ -77,7 +77,7 @@ def following_acceleration(view: Observation, belief: Belief, row: int, lane: Pe
     half_length = 0.5 * (object_length * np.abs(np.cos(relative_yaw)) + object_width * np.abs(np.sin(relative_yaw)))
     half_width = 0.5 * (object_length * np.abs(np.sin(relative_yaw)) + object_width * np.abs(np.cos(relative_yaw)))
     lane_middle = lane.offset + lane.heading * distance_ahead + 0.5 * lane.curvature * distance_ahead**2
-    reach_aside = half_width + 0.5 * size[1] + PATH
+    reach_aside = half_width + 0.5 * size[1] + PATH_MARGIN
     is_in_path = (distance_ahead > 0.0) & (distance_ahead < REACH)
     is_in_path &= np.abs(lateral_offset - lane_middle) < reach_aside
     if not is_in_path.any():
@@ -88,13 +88,13 @@ def following_acceleration(view: Observation, belief: Belief, row: int, lane: Pe
         relative_yaw[is_in_path]
     )
     desired_gap = STANDSTILL + np.maximum(
-        ego_speed * HEADWAY + ego_speed * closing_speed / (2.0 * np.sqrt(PULL * COMFORT)), 0.0
+        ego_speed * HEADWAY + ego_speed * closing_speed / (2.0 * np.sqrt(MAX_ACCELERATION * COMFORT)), 0.0
     )
-    return float((PULL * (1.0 - (desired_gap / free_gap) ** 2)).min())
+    return float((MAX_ACCELERATION * (1.0 - (desired_gap / free_gap) ** 2)).min())
 
 
 def line_acceleration(view: Observation, row: int, half_length: float) -> float:
-    """Return the acceleration that stops at the line of a red light, m/s^2; inf where none is due."""
+    """Return the acceleration that stops the ego at the line of a red light, m/s^2; inf if it need not stop."""
     state, distance = view.signal[row].astype(np.float64).tolist()
     room = distance - half_length - 1.0
     if state not in (SignalState.RED, SignalState.YELLOW) or not -2.0 < room < REACH:

@@ -3,9 +3,9 @@
     camera -> road seen from above -> markings -> lane filter -> pure pursuit -> steering
     perceiver -> tracker -> belief -> distance -> throttle and brake
 
-Other road users are perceived as by every perceiving driver. The map does not steer: where no markings are in view the
-lane keeper holds the last lane by its own motion, and after a while it slows down and stops, as systems do that hand
-over to a driver who does not take over.
+It perceives other road users as every perceiving driver does. It steers without the map; speed limit and traffic lights
+are those of the observation. Where no markings are in view, it extrapolates the last lane by its own motion. After
+`PATIENCE` it slows down and stops, as systems do whose driver does not take over.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.perception import PerceivedLane
+from ssad.core.perception import LANE_CONFIDENCE, PerceivedLane
 from ssad.core.types import F32, F64, U8, Controller, Episode
 from ssad.drivers.lane_keeping.control import (
     COMFORT,
-    HARDEST,
-    PULL,
+    MAX_ACCELERATION,
+    MAX_DECELERATION,
     RESPONSE,
     bend_speed,
     following_acceleration,
@@ -32,7 +32,7 @@ from ssad.drivers.lane_keeping.control import (
     pursuit_curvature,
     steer_for,
 )
-from ssad.drivers.lane_keeping.lane import SURE, LaneFilter
+from ssad.drivers.lane_keeping.lane import LaneFilter
 from ssad.drivers.lane_keeping.markings import RoadGrid, RoadMap, marking_strength
 from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver
 from ssad.drivers.perceiving.parts import Perceiver, make_perceiver, part_version
@@ -40,7 +40,7 @@ from ssad.drivers.perceiving.perceivers import PerfectPerceiver, nuscenes_camera
 from ssad.world.models import agent_model
 
 CHANNEL: Final = "CAM_FRONT"
-PATIENCE: Final = 1.5  # s without markings before it slows down
+PATIENCE: Final = 1.5  # s without markings after which it slows down
 
 
 class _Scene:
@@ -62,11 +62,11 @@ class LaneKeeper(PerceivingDriver):
         perceiver: Source of detections of other road users, or its name (`ssad list perceivers`); None: a perfect
             detector, so that all errors are those of the lane.
         camera: Camera of the lane markings; None: the front camera of the nuScenes rig, 640 px wide.
-        grid: Top view in which markings are detected; None: the usual one.
+        grid: Top view in which markings are detected; None: `RoadGrid()`.
         **settings: Further arguments of `PerceivingDriver`.
 
     Raises:
-        ConfigError: A planner is given: the lane keeper plans itself.
+        ConfigError: A planner is given.
     """
 
     name = "lane-keeper"
@@ -80,7 +80,7 @@ class LaneKeeper(PerceivingDriver):
         **settings: Any,
     ) -> None:
         if settings.get("planner") is not None:
-            raise ConfigError("a lane keeper plans itself; leave out the planner")
+            raise ConfigError("lane-keeper: a lane keeper plans its own motion; leave out the planner")
         parts = make_perceiver(perceiver) if isinstance(perceiver, str) else perceiver or PerfectPerceiver()
         super().__init__(parts, **settings)
         self.controller = Controller.EXTERNAL
@@ -101,7 +101,7 @@ class LaneKeeper(PerceivingDriver):
         return {**super().cameras, CHANNEL: self.lane_camera}
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """Forget the past."""
+        """Begin new episodes: forget lanes and poses."""
         super().reset(episodes)
         bodies = [agent_model(episode.agents[0]) for episode in episodes]
         self._scenes = [
@@ -135,13 +135,13 @@ class LaneKeeper(PerceivingDriver):
             acceleration, steer = self._cruise(scene, view, row, lane)
             if lane is not None:
                 following = following_acceleration(view, belief, row, lane, scene.size)
-                acceleration = max(min(acceleration, following), -HARDEST)
+                acceleration = max(min(acceleration, following), -MAX_DECELERATION)
             throttle, brake = acceleration / scene.power[0], -acceleration / scene.power[1]
             controls[row] = np.clip([throttle, brake, steer], [0.0, 0.0, -1.0], 1.0)
         return controls
 
     def _lane(self, scene: _Scene, view: Observation, row: int, image: Any) -> PerceivedLane | None:
-        """Return the lane at the present time, from the image if it is not lost."""
+        """Return the present lane, predicted and, where there is an image, corrected with it."""
         pose, time = view.pose[row].astype(np.float64), float(view.time[row])
         if scene.pose is not None:
             forward = float(np.hypot(*(pose[:2] - scene.pose[:2])))
@@ -149,11 +149,11 @@ class LaneKeeper(PerceivingDriver):
             scene.filter.predict(forward, turn, time - scene.time)
         scene.pose, scene.time = pose, time
         pixels: U8 = image.cpu().numpy() if hasattr(image, "cpu") else np.asarray(image)
-        lane = scene.filter.held()
+        lane = scene.filter.prediction()
         if pixels.any():  # an image of zeros is a loss of signal
             grid = self.road_map.grid
             lane = scene.filter.correct(marking_strength(self.road_map.brightness(pixels), grid))
-        is_lost = lane is None or lane.confidence < SURE
+        is_lost = lane is None or lane.confidence < LANE_CONFIDENCE
         scene.lost_since = None if not is_lost else scene.lost_since if scene.lost_since is not None else time
         if self.watch is not None:
             self.watch(LaneEvent(int(view.scene[row]), time, lane, pixels))
@@ -165,7 +165,7 @@ class LaneKeeper(PerceivingDriver):
         if lane is None:
             return -COMFORT, 0.0
         target = min(float(view.target_speed[row]), bend_speed(lane))
-        acceleration = float(np.clip((target - speed) / RESPONSE, -COMFORT, PULL))
+        acceleration = float(np.clip((target - speed) / RESPONSE, -COMFORT, MAX_ACCELERATION))
         if scene.lost_since is not None and scene.time - scene.lost_since > PATIENCE:
             acceleration = -COMFORT
         acceleration = min(acceleration, line_acceleration(view, row, 0.5 * float(scene.size[0])))

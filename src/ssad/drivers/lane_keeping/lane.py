@@ -12,22 +12,21 @@ from typing import Final
 
 import numpy as np
 
-from ssad.core.perception import PerceivedLane
+from ssad.core.perception import LANE_CONFIDENCE, PerceivedLane
 from ssad.core.types import F32, F64
 from ssad.drivers.lane_keeping.markings import RoadGrid
 
-# reach, m, and half width, m, around the predicted line, of the fits one after the other: each extends the one before
+# reach, m, and half width of the window around the predicted line, m: each fit extends the one before
 FITS: Final = ((14.0, 0.7), (20.0, 0.6), (28.0, 0.5), (np.inf, 0.4))
 NOISE: Final = 0.35  # m, standard deviation of the place of a marking in one row; neighbouring rows err together
 NOISE_STEP: Final = 0.25  # m from one of these rows to the next
 FULL_WEIGHT: Final = 12.0  # m up to which rows count fully; further ones as they shrink in the image
-CHANGE: Final = (0.05, 0.02, 0.004, 0.02)  # standard deviation of the change of each number in a step of 0.1 s
+CHANGE: Final = (0.05, 0.02, 0.004, 0.02)  # standard deviation of the change of each number in a `STEP`
 INITIAL: Final = (0.6, 0.08, 0.01, 0.3)  # the same at the start
 STEP: Final = 0.1  # s
 USUAL_WIDTH: Final = 3.5  # m
 WIDTHS: Final = (2.6, 4.4)  # m
-SURE: Final = 0.7  # confidence from which on markings count as detected; below, the predicted lane is held
-HALF_ROWS: Final = 12  # rows of full strength with which a lane is as sure as not
+HALF_ROWS: Final = 12  # rows of full strength at which the confidence in a lane is one half
 SEARCH: Final = (  # values of offset, heading, curvature and width of the search for a lane
     np.arange(-1.2, 1.21, 0.15),
     np.array([-0.06, -0.03, 0.0, 0.03, 0.06]),
@@ -48,11 +47,11 @@ class LaneFilter:
         self.state: F64 | None = None
         self.covariance: F64 = np.diag(np.square(INITIAL))
         self._is_sure = True
-        ahead = grid.ahead
-        ones = np.ones_like(ahead)
-        self._row_weight = np.minimum(FULL_WEIGHT / ahead, 1.0) ** 2 * grid.row_step / NOISE_STEP
+        distances = grid.row_distance
+        ones = np.ones_like(distances)
+        self._row_weight = np.minimum(FULL_WEIGHT / distances, 1.0) ** 2 * grid.row_step / NOISE_STEP
         # Rows of the measurement matrix of the left line; the right line differs in the sign of the width.
-        self._left = np.stack([ones, ahead, 0.5 * ahead**2, 0.5 * ones], 1)
+        self._left = np.stack([ones, distances, 0.5 * distances**2, 0.5 * ones], 1)
         self._right = self._left * [1.0, 1.0, 1.0, -1.0]
 
     def predict(self, forward: float, turn: float, seconds: float) -> None:
@@ -68,14 +67,14 @@ class LaneFilter:
         motion = np.eye(4)
         motion[0, 1], motion[0, 2], motion[1, 2] = forward, 0.5 * forward**2, forward
         self.state = motion @ self.state
-        # The ego turns about the half of its way.
+        # The ego turns evenly on its way: its mean heading is that after half of the turn.
         self.state[0] -= 0.5 * forward * turn
         self.state[1] -= turn
         steps = seconds / STEP if self._is_sure else 0.0
         self.covariance = motion @ self.covariance @ motion.T + np.diag(np.square(CHANGE)) * steps
 
-    def held(self) -> PerceivedLane | None:
-        """Return the predicted lane, without confidence; None as long as none was found."""
+    def prediction(self) -> PerceivedLane | None:
+        """Return the predicted lane, with a confidence of 0; None before the first detection."""
         return None if self.state is None else _lane_of(self.state, 0.0)
 
     def correct(self, strength: F32) -> PerceivedLane | None:
@@ -85,7 +84,7 @@ class LaneFilter:
             strength: [R, C], as `ssad.drivers.lane_keeping.markings.marking_strength` returns it.
 
         Returns:
-            The lane; None as long as none was found.
+            The lane; None before the first detection.
         """
         if self.state is None:
             self.state = search_lane(strength, self.grid)
@@ -99,7 +98,7 @@ class LaneFilter:
             weights = []
             for design in (self._left, self._right):
                 place, weight = line_places(strength, self.grid, design @ self.state, window)
-                weight = np.where(self.grid.ahead <= reach, weight, 0.0)
+                weight = np.where(self.grid.row_distance <= reach, weight, 0.0)
                 precision = weight * self._row_weight / NOISE**2
                 information += (design * precision[:, None]).T @ design
                 pull += design.T @ (precision * place)
@@ -109,9 +108,9 @@ class LaneFilter:
             total = sum(weights) * self.grid.row_step / NOISE_STEP
             confidence = total / (total + HALF_ROWS)
             covariance = np.linalg.inv(information)
-        self._is_sure = confidence >= SURE
+        self._is_sure = confidence >= LANE_CONFIDENCE
         if not self._is_sure:
-            # A few spurious ridges would pull a lane without lines away: it moves with the ego alone.
+            # Where there are no lines, a few spurious ridges would pull the lane away: it moves with the ego alone.
             self.state = prior
         else:
             self.covariance = 0.5 * (covariance + covariance.T)
@@ -136,7 +135,7 @@ def line_places(strength: F32, grid: RoadGrid, line: F64, window: float) -> tupl
     Returns:
         Places [R], m, and weights [R], 0 to 1.
     """
-    offsets = grid.lateral[None] - line[:, None]
+    offsets = grid.column_offset[None] - line[:, None]
     inside = np.where(np.abs(offsets) <= window, strength, 0.0)
     total = inside.sum(1)
     place = line + (inside * offsets).sum(1) / np.maximum(total, 1e-9)
@@ -145,22 +144,22 @@ def line_places(strength: F32, grid: RoadGrid, line: F64, window: float) -> tupl
 
 
 def search_lane(strength: F32, grid: RoadGrid) -> F64 | None:
-    """Return the lane [4] of offset, heading, curvature and width with the clearest lines; None: there is none.
+    """Return the lane [4] of offset, heading, curvature and width with the clearest lines; None without lines.
 
-    Both lines must be there, and a lane near the middle of the ego counts more than a neighbouring one.
+    Both lines must be visible. Of two lanes, the one nearer to the middle of the ego scores higher.
 
     Args:
         strength: [R, C].
         grid: Its grid.
     """
     offsets, headings, curvatures, widths = (values.ravel() for values in np.meshgrid(*SEARCH, indexing="ij"))
-    rows = np.arange(0, len(grid.ahead), 2)
-    ahead = grid.ahead[rows]
+    rows = np.arange(0, len(grid.row_distance), 2)
+    distances = grid.row_distance[rows]
     blurred = _widened(strength[rows])
-    middle = offsets[:, None] + headings[:, None] * ahead + 0.5 * curvatures[:, None] * ahead**2
+    middle = offsets[:, None] + headings[:, None] * distances + 0.5 * curvatures[:, None] * distances**2
     support = []
     for side in (0.5, -0.5):
-        columns = np.rint((grid.lateral[0] - (middle + side * widths[:, None])) / grid.column_step).astype(int)
+        columns = np.rint((grid.column_offset[0] - (middle + side * widths[:, None])) / grid.column_step).astype(int)
         is_inside = (columns >= 0) & (columns < strength.shape[1])
         values = blurred[np.arange(len(rows)), columns.clip(0, strength.shape[1] - 1)]
         support.append(np.where(is_inside, values, 0.0).sum(1))

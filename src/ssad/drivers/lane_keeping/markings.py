@@ -31,7 +31,7 @@ class RoadGrid:
     Attributes:
         near: First row, m ahead of the middle of the ego.
         far: Last row, m ahead.
-        half_width: Columns reach so far to either side, m.
+        half_width: From the middle column to the outermost ones, m.
         row_step: Distance of rows, m.
         column_step: Distance of columns, m.
     """
@@ -44,16 +44,19 @@ class RoadGrid:
 
     def __post_init__(self) -> None:
         if not (0.0 < self.near < self.far and min(self.half_width, self.row_step, self.column_step) > 0.0):
-            raise ConfigError("a top view needs 0 < near < far, and a width and steps above 0")
+            raise ConfigError(
+                f"lane keeping: a top view from {self.near:g} to {self.far:g} m, {self.half_width:g} m to either side, "
+                f"in steps of {self.row_step:g} and {self.column_step:g} m; give 0 < near < far, and all others above 0"
+            )
 
     @property
-    def ahead(self) -> F64:
-        """Distance of each row [R], m."""
+    def row_distance(self) -> F64:
+        """Distance of each row in front of the ego [R], m."""
         return np.arange(self.near, self.far + 1e-9, self.row_step, dtype=np.float64)
 
     @property
-    def lateral(self) -> F64:
-        """Place of each column [C], m to the left."""
+    def column_offset(self) -> F64:
+        """Offset of each column from the middle of the ego [C], m to the left."""
         count = round(self.half_width / self.column_step)
         return np.arange(count, -count - 1, -1, dtype=np.float64) * self.column_step
 
@@ -73,7 +76,7 @@ class RoadMap:
     @cached_property
     def pixels(self) -> tuple[F32, F32]:
         """Column and row of the image under each place of the grid [R, C]; -1 outside the image."""
-        ahead, lateral = np.meshgrid(self.grid.ahead, self.grid.lateral, indexing="ij")
+        ahead, lateral = np.meshgrid(self.grid.row_distance, self.grid.column_offset, indexing="ij")
         points = np.stack([ahead, lateral, np.zeros_like(ahead), np.ones_like(ahead)])
         x, y, z, _ = np.tensordot(np.linalg.inv(self.camera.to_ego), points, 1)
         u, v, _ = np.tensordot(self.camera.intrinsic, np.stack([x, y, z]) / np.maximum(z, 1e-6), 1)
@@ -102,24 +105,24 @@ class RoadMap:
             )
         grey = image[:2].astype(np.float32).mean(0)
         columns, rows = self.pixels
-        seen = cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.where(columns < 0.0, np.float32(np.nan), seen)
+        road_pixels = cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(columns < 0.0, np.float32(np.nan), road_pixels)
 
 
 def marking_strength(brightness: F32, grid: RoadGrid) -> F32:
     """Return how clearly each place shows a marking, [R, C] in 0 to 1.
 
     Args:
-        brightness: [R, C], code values; NaN where unknown, which shows no marking.
+        brightness: [R, C], code values; NaN outside the image, where no marking is detected.
         grid: Their grid.
     """
     shift = max(1, round(SIDE / grid.column_step))
     padded = np.pad(brightness, ((0, 0), (shift, shift)), constant_values=np.nan)
     sides = np.fmax(padded[:, : -2 * shift], padded[:, 2 * shift :])
     sides = np.where(np.isnan(padded[:, : -2 * shift] + padded[:, 2 * shift :]), np.nan, sides)
-    # Dark rows count as unknown: noise would be a ridge there.
-    known = ~np.isnan(brightness)
-    level = np.where(known, brightness, 0.0).sum(1) / np.maximum(known.sum(1), 1)
+    # Noise would be a ridge in a dark row: its infinite level leaves no contrast.
+    is_inside = ~np.isnan(brightness)
+    level = np.where(is_inside, brightness, 0.0).sum(1) / np.maximum(is_inside.sum(1), 1)
     level = np.where(level < DARKEST, np.inf, level)[:, None]
     contrast = (brightness - sides) / level
     strength = (contrast - CONTRAST) / (FULL_CONTRAST - CONTRAST)

@@ -90,7 +90,7 @@ class LaneEvent:
     Attributes:
         scene: Index of the scene.
         time: s.
-        lane: The lane; None: none was found yet.
+        lane: The lane; None before the first detection.
         image: Image that it was detected in, uint8 [3, H, W].
     """
 

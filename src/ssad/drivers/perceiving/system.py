@@ -80,8 +80,8 @@ class PerceivingSystem(Schema):
             input_width, missed, burst, noise and phantoms describe (`ssad list perceivers`).
         tracker: tracker in place of the one that confirm, reserve, high and low describe (`ssad list trackers`).
         planner: planner in place of the Autopilot's (`ssad list planners`).
-        steers_by: route: it follows its route, which is given; markings: a lane keeper, which steers by the lane
-            markings that it detects in its front camera (`ssad.drivers.lane_keeping`), and stops where it loses them.
+        steers_by: route: it follows its given route; markings: a lane keeper, which steers by the lane markings that it
+            detects in its front camera (`ssad.drivers.lane_keeping`), and stops where it loses them.
     """
 
     name: str = Field(min_length=1)
@@ -178,7 +178,7 @@ class PerceivingSystem(Schema):
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
         if self.keeps_lane and self.planner is not None:
-            raise ConfigError(f"system {self.name}: with steers_by: markings the lane keeper plans; remove planner")
+            raise ConfigError(f"system {self.name}: steers_by: markings has no planner; remove the key planner")
         if self.sign_memory is not None and not self.reads_signs:
             raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
         for kind, keys in (("perceiver", KEYS_OF_PERCEIVER), ("tracker", KEYS_OF_TRACKER)):

@@ -18,7 +18,7 @@ Course = Mapping[str, Sequence[float]]
 
 
 def course_plot(courses: Mapping[str, Mapping[str, Course]], *, label: str) -> str:
-    """Draw a panel for each drive and a line for each condition of it; as SVG text.
+    """Return the SVG of a panel for each drive, with a line for each condition.
 
     Args:
         courses: Title of the panel -> label of the line -> its course; at least one.

@@ -298,7 +298,7 @@ def sign_table(run: Run) -> Table:
 
 
 def lane_table(run: Run) -> Table:
-    """Return how lane keepers kept their lane, a row a condition."""
+    """Return the metrics of lane keeping, a row for each condition."""
     return Table.pivot(
         "lanes",
         "Lane keeping",
@@ -308,14 +308,14 @@ def lane_table(run: Run) -> Table:
         metric=_cell,
         condition=lambda lines: not all(math.isnan(metric_of(line, "lane_deviation")) for line in lines),
         note="CR, OR, DR, RC: collision rate, distance driven off the road, mean distance to the route, share of it "
-        "that is completed. A drive leaves the lane where the body crosses a line; after: from the moment when the "
-        "cause comes into view, or from the start where there is none, of the drives that do. From the middle: mean "
+        "that is completed. A drive leaves the lane where the body crosses a line. After: time from when the cause "
+        "comes into view, or from the start where there is none, over the drives that leave it. From the middle: mean "
         "distance to it. Error of the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
     )
 
 
 def lane_courses(run: Run) -> str:
-    """Draw the deviation along each scenario, a panel a scenario and a line a condition; "" without lane keepers."""
+    """Return the SVG of the deviation along each scenario, a line for each condition; "" without lane keepers."""
     courses: dict[str, dict[str, Mapping[str, Sequence[float]]]] = {}
     for line in run.lines:
         if line.get("lane") and not line["spec"].get("repetition", 0):

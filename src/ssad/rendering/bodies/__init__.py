@@ -45,7 +45,7 @@ class BodyKind:
 
 
 def _target_style(model: str) -> BodyStyle:
-    """Style of a test target, with the exact size of its model of the world; nobody draws it at random."""
+    """Return the style of a test target, with the size of its model in the world; it is never drawn at random."""
     target = MODELS[model]
     return BodyStyle((target.length, target.width, target.height), 0.0, 0.0)
 

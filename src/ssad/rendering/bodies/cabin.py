@@ -1,7 +1,7 @@
 """Cabins of cars behind their panes: seats, dashboard, steering wheel, the driver, and the light from beyond.
 
 A pane is opaque to the visibility pass. So the cabin is drawn on it, a few millimetres in front, with the gloss of
-glass: reflections run on over it, and it costs some dozens of triangles.
+glass: reflections continue over it, and it costs some dozens of triangles.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ssad.rendering.bodies.parts import GLASS, both_sides
 from ssad.rendering.bodies.shell import U1, U2, Shell, axle_x, sections
 from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, part_of
 
-BEYOND = replace(GLASS, colour=(0.085, 0.094, 0.102))  # the world behind the car, through two panes
+BEYOND = replace(GLASS, colour=(0.085, 0.094, 0.102))  # the surroundings, through two panes
 SEAT = replace(GLASS, colour=(0.010, 0.010, 0.011))
 CLOTH = replace(GLASS, colour=(0.034, 0.034, 0.036))  # front of a seat, in the light of the windscreen
 BOARD = replace(GLASS, colour=(0.007, 0.007, 0.008))
@@ -39,8 +39,8 @@ class DriverColours:
     shirt: Material
 
     @classmethod
-    def drawn(cls, share: float) -> DriverColours:
-        """Return the driver for a random share in [0, 1)."""
+    def from_share(cls, share: float) -> DriverColours:
+        """Return the colours for a random share in [0, 1)."""
         skin = SKIN_TINTS[int(share * 1e3) % len(SKIN_TINTS)]
         shirt = SHIRT_TINTS[int(share * 1e4) % len(SHIRT_TINTS)]
         return cls(replace(GLASS, colour=skin), replace(GLASS, colour=shirt))
@@ -68,14 +68,14 @@ class _Pane:
 
 
 def cabin(shell: Shell, size: Point, body: Mesh, *, detail: int, driver: DriverColours | None) -> list[Mesh]:
-    """Return what shows behind the panes of a car.
+    """Return the meshes on the panes of a car that show its cabin.
 
     Args:
         shell: Its shell.
         size: Length, width, height, m.
         body: The mesh of the shell.
         detail: 1 or 2.
-        driver: Who drives; None for a parked car.
+        driver: Colours of the driver; None for a parked car.
     """
     is_glass = np.array([material == GLASS for material in body.materials])[body.material]
     panes = part_of(body, is_glass)
@@ -97,7 +97,7 @@ def _pane(surface: Surface) -> _Pane | None:
 
 
 def _behind(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
-    """The rear window: headrests before the light of the windscreen."""
+    """Rear window: headrests before the light of the windscreen."""
     window_pane = _pane(surface)
     if window_pane is None:
         return []
@@ -125,7 +125,7 @@ def _behind(surface: Surface, detail: int, driver: DriverColours | None) -> list
 
 
 def _ahead(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
-    """The windscreen: dashboard, seats and steering wheel before the light of the rear window."""
+    """Windscreen: dashboard, seats and steering wheel before the light of the rear window."""
     window_pane = _pane(surface)
     if window_pane is None:
         return []
@@ -167,7 +167,7 @@ def _arc(middle: tuple[float, float], half: tuple[float, float], thickness: floa
 
 
 def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
-    """The side windows, left: front seat and driver, rear seat, before the light of the windows opposite."""
+    """Side windows on the left: front seat and driver, rear seat, before the light of the windows opposite."""
     if not len(surface.corners):
         return []
     corner_count = 8 if detail == 2 else 6
@@ -219,7 +219,7 @@ def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: Dri
 
 
 def _window_edges(shell: Shell, size: Point, start: float, end: float) -> tuple[F64, F64] | None:
-    """Lower and upper end (x, z) of the front and of the rear edge of a side window [2, 2], m; None if it is none."""
+    """Return lower and upper end (x, z) of the front and the rear edge of a side window [2, 2], m; None without one."""
     half_sections = sections(shell, size, np.array([start, end]), detail=2)
     edges = half_sections[:, [U1, U2]][..., [0, 2]]
     edges[:, :, 0] = [[axle_x(shell, size, start)] * 2, [axle_x(shell, size, end)] * 2]

@@ -247,7 +247,7 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int,
         parts += rear_details(shell, size, body, detail=detail, chrome=chrome)
         parts += front_details(shell, size, body, detail=detail)
         # The share of the roof rails also picks the driver: a car takes the same number of draws with and without.
-        driver = DriverColours.drawn(roof_rails) if has_driver and not is_target else None
+        driver = DriverColours.from_share(roof_rails) if has_driver and not is_target else None
         parts += cabin(shell, size, body, detail=detail, driver=driver)
     mesh = finish(parts, charts(shell, size), size)
     return _printed(mesh) if is_target else mesh

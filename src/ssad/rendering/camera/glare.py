@@ -1,4 +1,4 @@
-"""Glare of a lens: the share of light that it scatters, and the ghosts that reflections between its surfaces make.
+"""Glare of a lens: the light that it scatters, and the ghosts that reflections between its surfaces make.
 
 A point of light is surrounded by a veil that falls with the angle t (degrees) as 10 / t^3 + 5 / t^2, for each lux at
 the lens: the disability glare of the eye of a young person (CIE 146:2002, valid from 0.1 degrees), times the glare of
@@ -260,7 +260,7 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
 
 
 def lamp_gains(scene: RenderScene) -> F64:
-    """Return the light that the lamps of a scene have at night beyond that of an image, and the least of a lit one.
+    """Return the light that the lamps of a scene have at night beyond that of an image, and the least that is lit.
 
     Args:
         scene: Street and bodies.
@@ -287,8 +287,8 @@ def add_glow(
 ) -> None:
     """Add the glow of lamps to the radiance of views at night whose sensor scatters.
 
-    Images show lamps far darker than they are, so that their colours do not drown. Their glow has the light of their
-    luminance.
+    Images show lamps far darker than they are, so that the sensor does not clip their colours. Their glow has the light
+    of their luminance.
 
     Args:
         radiance: Linear [B, H, W], a Warp array of vec3; changed in place.

@@ -1,7 +1,7 @@
-"""Environment probes: what glass, paint and metal of a view mirror.
+"""Environment probes, which glass, paint and metal of a view mirror.
 
 A probe is a panorama with distances, rendered from the street around the view. All views within a square of the map
-share one, so that a camera that drives needs a new one only every few metres, and a picture depends on its view alone.
+share one, so that a driving camera needs a new one only every few metres, and a picture depends on its view alone.
 Moving bodies are not part of it; in a scene without a street, the objects of the view take its place.
 """
 
@@ -125,7 +125,7 @@ def _probe_table(scene: RenderScene, centres: list[F64], texels: list[Any], rows
 
 
 def _probe_views(scene: RenderScene, view: View, centre: F64) -> VisibilityPass:
-    """Return what the four sides and the sky above a place show."""
+    """Return the visibility pass towards the four sides and the sky above a place."""
     poses = _probe_poses(centre)
     far = np.array([FAR] * 4 + [FAR_UP])
     draws = scene.gather_draw_calls(

@@ -53,7 +53,7 @@ from ssad.rendering.camera.sensor import (
     noise_levels,
     point_spread,
 )
-from ssad.rendering.camera.street_lighting import UNLIT, UNLIT_LUX, USUAL_CLASS, check_lighting
+from ssad.rendering.camera.street_lighting import DEFAULT_CLASS, UNLIT, UNLIT_LUX, check_lighting
 from ssad.rendering.camera.visibility import VisibilityPass, sun_map
 
 FAR = 500.0
@@ -410,7 +410,6 @@ def render(
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
         material = found_materials.numpy() if materials else None
     if finishes is not None:
-        to_world = wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device)
         surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
         inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
         wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
@@ -443,7 +442,7 @@ def _add_wet_reflections(output: Any, lens: Any, to_world: Any, lanes: int) -> N
 def _with_effects(view: View, effects: frozenset[str]) -> View:
     """Return the view without the objects of effects that are off, and with the lamps of those that are on."""
     if "street-lighting" in effects and not view.weather.lighting:
-        view = replace(view, weather=replace(view.weather, lighting=USUAL_CLASS))
+        view = replace(view, weather=replace(view.weather, lighting=DEFAULT_CLASS))
     if "low-beams" in effects and view.lamps:
         view = replace(view, lamps=with_low_beams(view.lamps))
     if all(not entry.effect or entry.effect in effects for entry in view.objects):

@@ -19,13 +19,13 @@ from ssad.rendering.street.model import Street
 from ssad.rendering.street.palette import STYLES
 
 UNLIT: Final = "unlit"
-UNLIT_LUX: Final = 1.0  # lux of a road without street lighting: what test protocols for night call dark
+UNLIT_LUX: Final = 1.0  # lux of a road without street lighting, the limit that night test protocols set
 LUMINANCE_COEFFICIENT: Final = 0.07  # cd/m^2 for 1 lux, asphalt of class R3
 # class -> mean luminance of the road, cd/m^2, and mean illuminance, lux (EN 13201-2:2015, tables 1 and 3)
 LUMINANCE: Final = {"M1": 2.0, "M2": 1.5, "M3": 1.0, "M4": 0.75, "M5": 0.5, "M6": 0.3}
 ILLUMINANCE: Final = {"P1": 15.0, "P2": 10.0, "P3": 7.5, "P4": 5.0, "P5": 3.0, "P6": 2.0}
 LIGHTING_CLASSES: Final = (*LUMINANCE, *ILLUMINANCE, UNLIT)
-USUAL_CLASS: Final = "M4"  # of main streets in towns
+DEFAULT_CLASS: Final = "M4"  # of main streets in towns
 
 SPREAD: Final = (2.0, 3.8)  # tangents of the half angles across and along the road
 SOFT: Final = 0.9

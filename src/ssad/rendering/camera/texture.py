@@ -264,3 +264,9 @@ def to_printable(colour: Tensor) -> Tensor:
 def to_linear(colour: Tensor) -> Tensor:
     """Convert sRGB in [0, 1], as in print or a PNG, to the linear RGB of textures."""
     return torch.where(colour <= 0.04045, colour / 12.92, ((colour.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(linear: Tensor) -> Tensor:
+    """Convert linear RGB in [0, 1] to sRGB: the inverse of `to_linear`."""
+    # The clamped root keeps the unused branch of `where` finite.
+    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)

@@ -1,4 +1,4 @@
-"""Visibility passes: what each sample of a view, and each texel of a shadow map of the sun, shows."""
+"""Visibility passes over the samples of views and the texels of shadow maps of the sun."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def windows(
 def _inside_windows(
     wall: Wall, x: F64, z: F64, size: tuple[float, float], materials: TownMaterials
 ) -> list[TrianglePiece]:
-    """What is seen through windows: curtains at their sides, blinds half down, the lighter wall of a room, a sill."""
+    """View through windows: curtains at their sides, blinds half down, the lighter wall of a room, a sill."""
     rng, (width, height) = materials.details, size
     inside = 0.049  # m before the wall: just before the glass, whose gloss these materials have
     kind = rng.random(len(x))
@@ -150,7 +150,7 @@ def _inside_windows(
 def shop_window(
     wall: Wall, x: float, z: float, size: tuple[float, float], materials: TownMaterials
 ) -> list[TrianglePiece]:
-    """What is seen through a shop window: the back of the shop, its lit ceiling, shelves of goods and a poster."""
+    """View through a shop window: the back of the shop, its lit ceiling, shelves of goods and a poster."""
     rng, (width, height) = materials.details, size
     inside = wall.quads
     back_height = rng.uniform(0.55, 0.7) * height

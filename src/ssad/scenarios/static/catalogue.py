@@ -40,14 +40,14 @@ FAMILIES: Final = ("shift", "digital", "texture", "light", "fault")
 SPELLINGS: Final = {"attack": "digital", "perturbation": "own"}  # keys of an entry beside the families themselves
 GROUPS: Final = {"shift": "shift", "digital": "attack", "light": "light", "fault": "fault", "own": "perturbation"}
 STREET: Final = "ssad.scenarios.static.physical.street"
-OWN: Final[dict[str, str]] = {
+STREET_PERTURBATIONS: Final[dict[str, str]] = {
     "dirty-road": f"{STREET}.dirty_road:DirtyRoad",
     "phantom": f"{STREET}.phantom:Phantom",
     "lens-light": f"{STREET}.lens_light:LensLight",
     "sign-change": f"{STREET}.signs:SignChange",
     "head-light": f"{STREET}.signs:HeadLight",
 }
-"""Perturbations of SSAD that name their family themselves, as those of packages do."""
+"""Perturbations that state their own family, as those of packages do."""
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that a digital attack may move a pixel by, by severity
 # Attacks that take five gradient steps unless a suite sets them: two steps of 16 code values change nothing on YOLOv5n.
 STEPPED: Final = ("pgd", "cw", "momentum", "apgd")
@@ -276,11 +276,12 @@ class UserEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True for a class with an argument `severity`."""
-        return _takes_severity("perturbation", self.name, OWN)
+        return _takes_severity("perturbation", self.name, STREET_PERTURBATIONS)
 
     def make(self, severity: int) -> Perturbation:
         """Return the perturbation at a severity."""
-        perturbation = _make_object("perturbation", self.name, self.options, severity, ("name", "family"), OWN)
+        attributes = ("name", "family")
+        perturbation = _make_object("perturbation", self.name, self.options, severity, attributes, STREET_PERTURBATIONS)
         if not isinstance(perturbation, Perturbation):
             raise ConfigError(
                 f"perturbation '{self.name}': of type {type(perturbation).__name__}, which does not derive from "
@@ -438,7 +439,7 @@ def _registered(search_path: tuple[str, ...]) -> Mapping[str, str]:
         names |= dict.fromkeys(offered_names(f"ssad.{group}s"), family)
     names |= dict.fromkeys((*CONTROLS, *shipped_textures()), "texture")
     names |= dict.fromkeys((name for name in ATTACKS if not needs(name)), "digital")
-    names |= dict.fromkeys((NIGHT, *LIGHTS), "light") | dict.fromkeys(OWN, "own")
+    names |= dict.fromkeys((NIGHT, *LIGHTS), "light") | dict.fromkeys(STREET_PERTURBATIONS, "own")
     return MappingProxyType(names | dict.fromkeys(FAULTS, "fault") | dict.fromkeys(KNOWN, "shift"))
 
 

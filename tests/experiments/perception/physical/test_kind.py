@@ -180,7 +180,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"judges": ["yolov5n"]}, ConfigError, "yolov5n appears twice"),
         ({"grid": {"distances": [1.0]}}, ConfigError, "distances: 3 to 80 m"),
         ({"grid": {"weathers": ["hail"]}}, UnknownNameError, "hail"),
-        ({"approach": {"distances": [5.0, 90.0]}}, ConfigError, "approach: 3 to 80 m"),
+        ({"approach": {"distances": [5.0, 90.0]}}, ConfigError, "give distances from 3 to 80 m"),
         ({"approach": {"distances": [5.0, 80.0], "size": 320}}, ConfigError, "a car 80 m away needs 431"),
         ({"attacks": [{"name": "random", "project": True}]}, ConfigError, "project is for a texture"),
         ({"lights": [{"name": "projector", "settings": {"inks": True}}]}, ConfigError, "light, not print"),

@@ -98,7 +98,7 @@ def test_what_cannot_be_run_is_one_line(tmp_path: Path) -> None:
     for changes, words in (
         ({"data": ""}, "--set data=FOLDER"),
         ({"data": str(tmp_path / "nowhere")}, "no such folder"),
-        ({"textures": ["adv-patch-yolov5n-stop-sign-twinford"]}, "only cars"),
+        ({"textures": ["adv-patch-yolov5n-stop-sign-twinford"]}, "made for a car"),
         ({"textures": [PATCH, PATCH]}, "appears twice"),
         ({"detectors": ["yolov3"]}, "no weights of yolov3 are shipped"),
     ):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ssad.experiments.perception.physical.physical_run import PhysicalRun, is_control, learns_nothing, title_of
+from ssad.experiments.perception.physical.physical_run import PhysicalRun, is_control, learns_nothing, lower, title_of
 from ssad.metrics import replicate_difference
 from ssad.metrics.target_approach import (
     AXIS_FLOOR,
@@ -30,7 +30,7 @@ DASHES = (None, "7 3", "2 3")  # of the first five attacks, of the next five, ..
 
 @dataclass(frozen=True)
 class ApproachGroup:
-    """The approach to one target with one carrier before one detector.
+    """Approach to a target with one carrier, as one detector sees it.
 
     Attributes:
         test: Town of the test.
@@ -50,16 +50,16 @@ class ApproachGroup:
 
     @property
     def axis(self) -> list[float]:
-        """The distances at which attacks are scored, m."""
+        """Distances at which attacks are scored, m."""
         return list(self.clean["axis"])
 
     def control_at(self, distance: float, metric: str, attack: str | None = None) -> Line | None:
-        """Return the strongest control at a distance, of all draws; None: there is none.
+        """Return the strongest control at a distance, of all draws; None without controls.
 
         Args:
             distance: The distance, m.
             metric: AP50 or confidence.
-            attack: Attack whose controls count; None: those of any.
+            attack: Attack whose controls count; None for all controls.
         """
         controls = [line for line in self.controls if attack is None or learns_nothing(line["attack"], attack)]
         return min(controls, key=lambda line: float(_cell(line, distance)[metric] or 0.0), default=None)
@@ -70,14 +70,14 @@ class ApproachGroup:
         With intervals: the lower end of the paired difference, control less attack, is not above 0.
         """
         return any(
-            _lower(_difference(_cell(line, distance), _cell(attack, distance), metric)) <= 0.0
+            lower(_difference(_cell(line, distance), _cell(attack, distance), metric)) <= 0.0
             for line in self.controls
             if learns_nothing(line["attack"], attack["attack"])
         )
 
 
 def approach_groups(run: PhysicalRun) -> list[ApproachGroup]:
-    """Return the approaches of a run, those with an attack on them."""
+    """Return the approaches of a run that have an attack."""
     groups = []
     carriers = list(dict.fromkeys(carrier for name, carrier in run.attacks if name != "clean"))
     for (_, test), detector, carrier in product(run.pairs, run.judges, carriers):
@@ -113,10 +113,6 @@ def _difference(larger: dict[str, Any], smaller: dict[str, Any], metric: str) ->
         return TableCell(difference)
     pairs = [first - second for first, second in zip(*replicates, strict=False)]
     return TableCell.of(replicate_difference(difference, pairs, n=larger["n"], clusters=larger["drives"]))
-
-
-def _lower(cell: TableCell) -> float:
-    return cell.mean if math.isnan(cell.low) else cell.low
 
 
 def approach_figures(run: PhysicalRun) -> list[tuple[str, str]]:
@@ -175,10 +171,10 @@ def _figure(group: ApproachGroup) -> str:
 def _rows(run: PhysicalRun) -> list[tuple[ApproachGroup, Line | None, Line]]:
     """Return the groups with the attack of a row (None: a clean row or that of controls) and its record."""
     rows: list[tuple[ApproachGroup, Line | None, Line]] = []
-    shown: set[tuple[str, str]] = set()
+    listed_groups: set[tuple[str, str]] = set()
     for group in approach_groups(run):
-        if (group.test, group.detector) not in shown:
-            shown.add((group.test, group.detector))
+        if (group.test, group.detector) not in listed_groups:
+            listed_groups.add((group.test, group.detector))
             rows.append((group, None, group.clean))
         rows += [(group, None, line) for line in group.controls]
         rows += [(group, line, line) for line in group.attacks]
@@ -189,10 +185,10 @@ def approach_table(run: PhysicalRun, metric: str) -> Table:
     """Return a score against distance, AP50 or confidence: clean, the strongest control at each distance, attacks."""
     Row = tuple[ApproachGroup, str, Line | None]
     rows: list[Row] = []
-    shown: set[tuple[str, str]] = set()
+    listed_groups: set[tuple[str, str]] = set()
     for group in approach_groups(run):
-        if (group.test, group.detector) not in shown:
-            shown.add((group.test, group.detector))
+        if (group.test, group.detector) not in listed_groups:
+            listed_groups.add((group.test, group.detector))
             rows.append((group, "clean", group.clean))
         rows += [(group, f"strongest control, {group.carrier}", None)] if group.controls else []
         rows += [(group, title_of((line["attack"], line["carrier"])), line) for line in group.attacks]
@@ -232,7 +228,7 @@ def approach_table(run: PhysicalRun, metric: str) -> Table:
 
 
 def detection_table(run: PhysicalRun) -> Table:
-    """Return at what distance the target is first detected, and what is left of it after a stop."""
+    """Return the distance at which the target is first detected, and the rest of it after a stop."""
     rows = _rows(run)
     columns = {0.0: "first detected, m"} | {speed: f"left after a stop from {speed:g} km/h, m" for speed in SPEEDS}
 

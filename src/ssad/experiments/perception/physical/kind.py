@@ -124,7 +124,7 @@ class Physical(OpenLoopKind):
         suite.recordings(Path(), "cpu")
 
     def order(self, cell: Cell) -> float:
-        """From behind, on the way to it, from all around; in each clean first, then controls, then what is trained."""
+        """Return the priority of a cell: by view, and in each view clean cells, controls, trained attacks."""
         stage = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
         return stage + 3 * VIEWS.index(cell.fields["view"])
 

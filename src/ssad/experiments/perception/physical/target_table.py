@@ -213,7 +213,7 @@ class TargetTable(Schema):
         return self.approach.size if self.approach is not None and self.approach.train else self.size
 
     def recordings(self, folder: Path, device: str) -> list[TargetRecording]:
-        """What is recorded below a folder: drives of each town, approaches, the grid, and views from all around.
+        """Return the recordings below a folder: drives of each town, approaches, the grid, and views from all around.
 
         Raises:
             ConfigError: A value that cannot be.

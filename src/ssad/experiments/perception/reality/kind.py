@@ -1,4 +1,4 @@
-"""Kind `reality`: detectors x annotated photographs, clean and with textures and their controls on the cars."""
+"""Kind `reality`: detectors x annotated photographs, clean, and with textures and their controls on the cars."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from ssad.experiments.perception.reality.photograph_boxes import (
     ROAD_CLASSES,
     PhotographBoxes,
     boxes_file,
+    cached_boxes,
     find_boxes,
-    kept_boxes,
     known_labels,
     true_boxes,
 )
 from ssad.experiments.perception.reality.sheets import write_sheets
 from ssad.experiments.perception.reality.verdict import verdict
 from ssad.experiments.perception.reality.worn_textures import (
+    CLEAN,
     TRAINED,
     WornCar,
     car_scores,
@@ -45,7 +46,6 @@ from ssad.report.tables import Table
 from ssad.scenarios.static.physical.textures.perturbation import Texture
 from ssad.scenarios.static.physical.textures.photographs import face_print
 
-CLEAN = "clean"
 MARGIN = (-1.0, 1.0)
 
 
@@ -100,7 +100,7 @@ def _beside(name: str, folder: Path) -> str:
 
 
 class Reality(Kind):
-    """See the module. A piece is the clean photographs, which all cells of a detector are compared with."""
+    """Kind `reality`. All cells of a detector share its boxes in the clean photographs."""
 
     name = "reality"
     suite = RealitySuite
@@ -130,7 +130,7 @@ class Reality(Kind):
             face_print(texture)
         names = [Texture(texture).name for texture in suite.textures]
         if len(set(names)) < len(names):
-            raise ConfigError(f"suite {suite.name}: textures: a name appears twice")
+            raise ConfigError(f"suite {suite.name}: textures: a name appears twice; give each texture once")
         photograph_set = read_photographs(Path(suite.data).expanduser(), suite.split).thinned(suite.photographs)
         data = data_identity(photograph_set)
         victims = detectors_of(suite.name, suite.detectors, allow_2d=True, scenes=False)
@@ -191,7 +191,7 @@ class Reality(Kind):
             cell.system, weights=settings["detectors"].get(cell.system) or None, device=job.device
         )
         clean_file = cell.spec["clean_boxes"]
-        clean = kept_boxes(
+        clean = cached_boxes(
             job.folder / clean_file, partial(find_boxes, detector, _clean_images(photographs), job.device)
         )
         cars = _cars(settings["data"], settings["split"], settings["photographs"], cell.spec["wearer_height"])
@@ -209,7 +209,7 @@ class Reality(Kind):
             colour = drawn_colour(worn, cell.fields["pasted"], draw)
             files.append(boxes_file(cell.system, f"{cell.key} {draw}"))
             find = partial(find_boxes, detector, worn_images(photographs, cars, worn, colour), job.device)
-            scores.append(car_scores(photographs, cars, kept_boxes(job.folder / files[-1], find)))
+            scores.append(car_scores(photographs, cars, cached_boxes(job.folder / files[-1], find)))
         clean_scores = np.tile(car_scores(photographs, cars, clean), draws)
         images = np.tile(np.array([car.image for car in cars], np.int32), draws)
         record = worn_scores(
@@ -282,7 +282,7 @@ def _add_cars(
 
 
 def data_identity(photograph_set: PhotographSet) -> dict[str, Any]:
-    """Return what results depend on of a set of photographs: its form, sizes, and a hash of images and annotations."""
+    """Return the form of a set of photographs, its numbers, and a hash of its images and annotations."""
     state = hashlib.sha256()
     objects = 0
     for photograph in photograph_set.photographs:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ssad.experiments.perception.reality.worn_textures import CLEAN
 from ssad.report.artefacts import pictures
 from ssad.report.load import Run
 from ssad.report.pages import render
@@ -14,7 +15,6 @@ from ssad.report.records import Line, field
 from ssad.report.tables import Table, TableCell
 
 TEMPLATE = Path(__file__).with_name("page.html")
-CLEAN = "clean"
 PERCENT = {"recall": "recall, %", "precision": "precision, %", "AP50": "AP50, %", "margin": "score margin, points"}
 COUNTS = {"boxes": "boxes per photograph", "wrong": "wrong boxes per photograph"}
 WORN = {"found": "found, %", "score": "mean score", "change": "change", "hidden": "hidden, %"}

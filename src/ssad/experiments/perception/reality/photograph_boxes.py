@@ -1,4 +1,4 @@
-"""Boxes that detectors find in photographs, kept in a file for each detector and condition."""
+"""Boxes that detectors find in photographs, cached in a file for each detector and condition."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ssad.metrics.detection2d import Boxes2D
 from ssad.metrics.target_attacks import THRESHOLD
 
 COARSE: Final = {"trailer": "truck", "construction_vehicle": "truck"}
-"""Class of `ssad.datasets.photographs` -> class of this kind, which all forms and detectors tell apart."""
+"""Class of `ssad.datasets.photographs` -> coarser class, which all forms and detectors distinguish."""
 ROAD_CLASSES: Final = tuple(name for name in CLASSES if name not in COARSE)
 CAR: Final = ROAD_CLASSES.index("car")
 
@@ -71,18 +71,18 @@ def true_boxes(photographs: Sequence[Photograph], labels: Sequence[int]) -> Boxe
         photographs: The photographs.
         labels: Indices into `ROAD_CLASSES`.
     """
-    chosen_rows: list[tuple[int, int, F64, bool]] = []
+    rows: list[tuple[int, int, F64, bool]] = []
     for number, photograph in enumerate(photographs):
         for box, fine_label in zip(photograph.box, photograph.label.tolist(), strict=True):
             if fine_label < 0:
-                chosen_rows += [(number, label, box, True) for label in labels]
+                rows += [(number, label, box, True) for label in labels]
             elif (label := road_label(CLASSES[fine_label])) in labels:
-                chosen_rows.append((number, label, box, False))
+                rows.append((number, label, box, False))
     return Boxes2D(
-        np.array([object_row[0] for object_row in chosen_rows], np.int32),
-        np.array([object_row[1] for object_row in chosen_rows], np.int32),
-        np.array([object_row[2] for object_row in chosen_rows], np.float64).reshape(-1, 4),
-        ignore=np.array([object_row[3] for object_row in chosen_rows], np.bool_),
+        np.array([row[0] for row in rows], np.int32),
+        np.array([row[1] for row in rows], np.int32),
+        np.array([row[2] for row in rows], np.float64).reshape(-1, 4),
+        ignore=np.array([row[3] for row in rows], np.bool_),
     )
 
 
@@ -133,18 +133,18 @@ def boxes_file(system: str, condition: str) -> str:
     return f"boxes/{digest('photograph boxes', system, condition)[:16]}.npz"
 
 
-def kept_boxes(path: Path, find_condition: Callable[[], PhotographBoxes]) -> PhotographBoxes:
+def cached_boxes(path: Path, find: Callable[[], PhotographBoxes]) -> PhotographBoxes:
     """Return boxes from their file, which is written first if there is none.
 
     Args:
         path: The file.
-        find_condition: Finds the boxes.
+        find: Finds the boxes.
 
     Raises:
         FormatError: The file is broken.
     """
     if not path.is_file():
-        detections = find_condition()
+        detections = find()
         safeio.make_folder(path.parent)
         safeio.save_npz(path, {name: getattr(detections, name) for name in PhotographBoxes.__dataclass_fields__})
     arrays = safeio.load_npz(path)

@@ -15,13 +15,13 @@ from ssad.core.images import add_caption, save_picture
 from ssad.core.registry import label_of
 from ssad.core.types import F64, U8
 from ssad.datasets.photographs import Photograph
-from ssad.detectors.drawing import FOUND, TRUE
+from ssad.detectors.drawing import FOUND, TRUE, write_beside
 from ssad.engine.kind import Cell, Plan
 from ssad.experiments.perception.reality.photograph_boxes import (
     ROAD_CLASSES,
     PhotographBoxes,
     boxes_file,
-    kept_boxes,
+    cached_boxes,
 )
 from ssad.experiments.perception.reality.worn_textures import (
     TRAINED,
@@ -32,10 +32,10 @@ from ssad.experiments.perception.reality.worn_textures import (
 )
 from ssad.scenarios.static.physical.textures.photographs import face_print
 
-SHOWN: Final = 6  # photographs on a sheet
-SHOWN_CARS: Final = 3
+PHOTOGRAPHS_ON_SHEET: Final = 6
+CARS_ON_SHEET: Final = 3
 WIDTH, CAR_WIDTH, COLUMNS = 800, 320, 2
-AROUND: Final = 2.5  # side of what is shown of a car, in longer sides of its box
+CROP_SIDE: Final = 2.5  # side of the part around a car, in longer sides of its box
 
 
 def write_sheets(plan: Plan, folder: Path, photographs: Sequence[Photograph], cars: Sequence[WornCar]) -> None:
@@ -54,7 +54,7 @@ def write_sheets(plan: Plan, folder: Path, photographs: Sequence[Photograph], ca
         if not clean_path.is_file():
             continue
         try:
-            clean = kept_boxes(clean_path, _absent)
+            clean = cached_boxes(clean_path, _absent)
             path = folder / "pictures" / f"{number + 1}-photographs.jpg"
             save_picture(path, photograph_sheet(photographs, clean, plan.suite.score))
             captions[path.name] = (
@@ -82,16 +82,16 @@ def _absent() -> PhotographBoxes:
 
 
 def photograph_sheet(photographs: Sequence[Photograph], boxes: PhotographBoxes, score: float) -> U8:
-    """Return the photographs with most objects, with annotated objects and boxes.
+    """Return the photographs with the most objects, with annotated objects and boxes drawn.
 
     Args:
         photographs: The photographs.
         boxes: Boxes in them.
         score: Least score of a box that is drawn.
     """
-    richest = sorted(range(len(photographs)), key=lambda number: -int((~photographs[number].ignored).sum()))[:SHOWN]
+    by_objects = sorted(range(len(photographs)), key=lambda number: -int((~photographs[number].ignored).sum()))
     sheet_tiles = []
-    for number in sorted(richest):
+    for number in sorted(by_objects[:PHOTOGRAPHS_ON_SHEET]):
         photograph = photographs[number]
         photograph_image = photograph.read()
         scale = WIDTH / photograph_image.shape[1]
@@ -103,7 +103,7 @@ def photograph_sheet(photographs: Sequence[Photograph], boxes: PhotographBoxes, 
         rows = (boxes.image == number) & (boxes.score >= score)
         for object_box, label, value in zip(boxes.box[rows] * scale, boxes.label[rows], boxes.score[rows], strict=True):
             _rectangle(canvas, object_box, FOUND, 2)
-            _write(canvas, f"{ROAD_CLASSES[label]} {value:.2f}", object_box)
+            write_beside(canvas, f"{ROAD_CLASSES[label]} {value:.2f}", object_box)
         sheet_tiles.append(add_caption(canvas, photograph.name, WIDTH))
     return _grid(sheet_tiles, COLUMNS)
 
@@ -115,7 +115,7 @@ def worn_sheet(
     cars: Sequence[WornCar],
     clean: PhotographBoxes,
 ) -> U8 | None:
-    """Return the highest cars clean, with a texture and with the first draw of each control; None without cells.
+    """Return the highest cars clean, with a texture, and with the first draw of each control.
 
     Args:
         cells: Cells of one detector and one texture.
@@ -123,8 +123,11 @@ def worn_sheet(
         photographs: The photographs.
         cars: The cars that wear textures.
         clean: Boxes in the clean photographs.
+
+    Returns:
+        The sheet; None without cars or finished cells.
     """
-    highest = sorted(cars, key=lambda wearing_car: -float(_height(photographs, wearing_car)))[:SHOWN_CARS]
+    highest = sorted(cars, key=lambda wearing_car: -float(_height(photographs, wearing_car)))[:CARS_ON_SHEET]
     finished = [cell for cell in cells if (folder / boxes_file(cell.system, f"{cell.key} 0")).is_file()]
     if not highest or not finished:
         return None
@@ -142,7 +145,7 @@ def worn_sheet(
         images = {
             number: photograph_image for number, photograph_image, _ in worn_images(photographs, chosen, worn, colour)
         }
-        boxes = kept_boxes(folder / boxes_file(cell.system, f"{cell.key} 0"), _absent)
+        boxes = cached_boxes(folder / boxes_file(cell.system, f"{cell.key} 0"), _absent)
         title = cell.fields["texture"] if cell.fields["pasted"] == TRAINED else cell.fields["pasted"]
         variants.append((title, images, car_scores(photographs, highest, boxes)))
     sheet_tiles = []
@@ -159,9 +162,9 @@ def _height(photographs: Sequence[Photograph], wearing_car: WornCar) -> Any:
 
 
 def _crop(photograph_image: U8, object_box: F64) -> U8:
-    height, sheet_width = photograph_image.shape[:2]
-    side = int(min(AROUND * (object_box[2:] - object_box[:2]).max(), height, sheet_width))
-    left = int(np.clip((object_box[0] + object_box[2] - side) / 2, 0, sheet_width - side))
+    height, width = photograph_image.shape[:2]
+    side = int(min(CROP_SIDE * (object_box[2:] - object_box[:2]).max(), height, width))
+    left = int(np.clip((object_box[0] + object_box[2] - side) / 2, 0, width - side))
     top = int(np.clip((object_box[1] + object_box[3] - side) / 2, 0, height - side))
     part = np.ascontiguousarray(photograph_image[top : top + side, left : left + side])
     return np.asarray(cv2.resize(part, (CAR_WIDTH, CAR_WIDTH), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -187,13 +190,6 @@ def _grid(sheet_tiles: list[U8], columns: int) -> U8:
     )
 
 
-def _rectangle(canvas: U8, object_box: F64, colour: tuple[int, int, int], sheet_width: int) -> None:
+def _rectangle(canvas: U8, object_box: F64, colour: tuple[int, int, int], thickness: int) -> None:
     left, top, right, bottom = (round(float(edge)) for edge in object_box)
-    cv2.rectangle(canvas, (left, top), (right, bottom), colour, sheet_width, cv2.LINE_AA)
-
-
-def _write(canvas: U8, text: str, object_box: F64) -> None:
-    position = (round(float(object_box[0])), max(round(float(object_box[1])) - 4, 12))
-    # A dark outline first, so that the text is readable on any background.
-    for colour, sheet_width in (((0, 0, 0), 3), (FOUND, 1)):
-        cv2.putText(canvas, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, sheet_width, cv2.LINE_AA)
+    cv2.rectangle(canvas, (left, top), (right, bottom), colour, thickness, cv2.LINE_AA)

@@ -1,18 +1,17 @@
-"""What each detector finds in photographs, and what textures do beside their controls, in sentences."""
+"""Findings of a run on photographs in sentences: objects found and missed, and textures beside their controls."""
 
 from __future__ import annotations
 
 import math
 
+from ssad.experiments.perception.reality.worn_textures import CLEAN, TRAINED
 from ssad.report.load import Run
 from ssad.report.records import metric_of
 from ssad.report.verdict import lines_by
 
-CLEAN, TRAINED = "clean", "trained"
-
 
 def verdict(run: Run) -> list[str]:
-    """Return recall and wrong boxes of each detector, and the texture that hides most beside its strongest control."""
+    """Return recall and wrong boxes of each detector, and the cars that each texture and its strongest control hide."""
     sentences = []
     for detector, lines in lines_by(run, "detector").items():
         for line in lines:

@@ -1,4 +1,4 @@
-"""Cars in photographs that wear a texture: which can, and how well a detector finds them."""
+"""Cars in photographs that wear a texture: their choice, and the scores with which a detector finds them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from ssad.metrics.target_attacks import TargetSighting
 from ssad.scenarios.static.physical.textures.controls import control
 from ssad.scenarios.static.physical.textures.photographs import FacePrint, face_quad, light_on, paste
 
+CLEAN: Final = "clean"
 TRAINED: Final = "trained"
 WHOLE_FACE: Final = (0.0, 0.0, 1.0, 1.0)
-BORDER: Final = 2.0  # pixels from the border within which a box is taken to be cut
+BORDER: Final = 2.0  # pixels from the border within which a box counts as cut
 MAX_COVERED: Final = 0.25  # share of a car's box that a nearer object may cover
 
 
@@ -101,7 +102,7 @@ def worn_images(
 
 
 def car_scores(photographs: Sequence[Photograph], cars: Sequence[WornCar], boxes: PhotographBoxes) -> F64:
-    """Return the score with which each car is found [N]; 0 if it is not. No box finds two cars."""
+    """Return the score with which each car is found [N], 0 if it is missed. Each box finds one car at most."""
     scores_by_car: dict[tuple[int, int], float] = {}
     for number in dict.fromkeys(wearing_car.image for wearing_car in cars):
         photograph = photographs[number]

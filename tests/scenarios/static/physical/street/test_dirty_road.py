@@ -13,11 +13,11 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.scenarios.static.perturbation import EGO
 from ssad.scenarios.static.physical.street.dirty_road import (
     ASPHALT_ALBEDO,
+    COVERING_WIDTH,
     DIRT,
+    INNER_WIDTH,
     LENGTH,
-    NARROW,
     SHIPPED_PATCHES,
-    WIDE,
     DirtyRoad,
     patch_size,
     road_decal,
@@ -33,12 +33,12 @@ def test_trained_patches_are_grey_within_the_limits_of_dirt(pattern: str) -> Non
     assert float(albedo.max()) <= DIRT[1] + STEP
     assert (albedo[0] == albedo[1]).all()
     assert (albedo[0] == albedo[2]).all()
-    assert patch_size(albedo) == pytest.approx((LENGTH, WIDE if pattern == "over" else NARROW))
+    assert patch_size(albedo) == pytest.approx((LENGTH, COVERING_WIDTH if pattern == "over" else INNER_WIDTH))
     assert len(DirtyRoad(pattern).version()) == 12
 
 
 def test_controls_have_the_greys_of_dirt_or_of_the_road() -> None:
-    random, clean = DirtyRoad("random").albedo(), DirtyRoad("clean", width=NARROW).albedo()
+    random, clean = DirtyRoad("random").albedo(), DirtyRoad("clean", width=INNER_WIDTH).albedo()
     assert random.shape == (3, 48, 52)
     assert DIRT[0] <= float(random.min()) < float(random.max()) <= DIRT[1]
     assert (DirtyRoad("random", seed=1).albedo() != random).any()

@@ -7,6 +7,7 @@ import pytest
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.images import decode_srgb
 from ssad.rendering.sensor_suite import SensorSuite
 from ssad.scenarios.static.physical.street.lens_light import (
     CORE,
@@ -17,7 +18,6 @@ from ssad.scenarios.static.physical.street.lens_light import (
     LensLight,
     full_scale,
 )
-from ssad.scenarios.static.physical.street.placing import decode
 
 CAMERA = Camera.typical(160, 96)
 DARK = np.full((96, 160, 3), 20, np.uint8)
@@ -52,13 +52,13 @@ def test_it_shines_from_its_place_and_not_from_behind_or_without_power() -> None
     place = np.array([30.0, 0.0, 1.5])
     lit = light.shine(DARK, CAMERA, np.eye(4), place, scale)
     dim = LensLight(power=5e-8).shine(DARK, CAMERA, np.eye(4), place, scale)
-    peak = np.unravel_index(int(decode(dim)[..., 1].argmax()), dim.shape[:2])
+    peak = np.unravel_index(int(decode_srgb(dim)[..., 1].argmax()), dim.shape[:2])
     assert np.hypot(peak[0] - 48, peak[1] - 80) < 3
     assert light.shine(DARK, CAMERA, np.eye(4), np.array([-30.0, 0.0, 1.5]), scale) is DARK
     np.testing.assert_array_equal(LensLight(power=0.0).shine(DARK, CAMERA, np.eye(4), place, scale), DARK)
     # By day the sensor is exposed for more light.
     by_day = light.shine(DARK, CAMERA, np.eye(4), place, full_scale(0.9))
-    assert decode(by_day).mean() < decode(lit).mean()
+    assert decode_srgb(by_day).mean() < decode_srgb(lit).mean()
     assert full_scale(-0.5) == pytest.approx(WHITE * DARKEST / np.pi)
 
 

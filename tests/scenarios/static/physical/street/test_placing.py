@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from ssad.core.frames import Camera
+from ssad.core.images import decode_srgb, encode_srgb
 from ssad.core.rotations import upright_pose
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.street.dirty_road import road_decal
-from ssad.scenarios.static.physical.street.placing import ROAD_ALBEDO, behind_target, decode, encode, paint_road
+from ssad.scenarios.static.physical.street.placing import ROAD_ALBEDO, behind_target, paint_road
 
 CAMERA = Camera.typical(320, 192)
 IMAGE = np.full((192, 320, 3), 90, np.uint8)
@@ -18,8 +19,8 @@ OPAQUE = np.ones((8, 8), np.float32)
 
 def test_codes_and_linear_values_are_inverse() -> None:
     codes = np.arange(256, dtype=np.uint8).reshape(1, -1)
-    np.testing.assert_array_equal(encode(decode(codes)), codes)
-    assert encode(np.array([[2.0]], np.float32))[0, 0] == 255
+    np.testing.assert_array_equal(encode_srgb(decode_srgb(codes)), codes)
+    assert encode_srgb(np.array([[2.0]], np.float32))[0, 0] == 255
 
 
 def test_paint_appears_where_the_road_is_and_keeps_the_light() -> None:
@@ -28,7 +29,7 @@ def test_paint_appears_where_the_road_is_and_keeps_the_light() -> None:
     painted = paint_road(IMAGE, CAMERA, np.eye(4), place, (10.0, 2.0), texture, light=None, opacity=OPAQUE)
     # By hand: 1.5 m below a camera that stands 1.7 m ahead of the ego's middle.
     row = round(96 + 0.79 * 320 * 1.5 / (15.0 - 1.7))
-    ratio = decode(painted)[row, 160] / decode(IMAGE)[row, 160]
+    ratio = decode_srgb(painted)[row, 160] / decode_srgb(IMAGE)[row, 160]
     np.testing.assert_allclose(ratio, 2.0, rtol=0.05)
     assert (painted[:100] == IMAGE[:100]).all()
     assert (painted[row, :100] == IMAGE[row, :100]).all()
@@ -41,7 +42,7 @@ def test_projected_light_adds_to_that_of_the_road_and_boxes_hide_it() -> None:
     settings = {"light": 0.5, "opacity": OPAQUE}
     lit = paint_road(IMAGE, CAMERA, np.eye(4), place, (10.0, 2.0), texture, **settings)  # type: ignore[arg-type]
     row = round(96 + 0.79 * 320 * 1.5 / (15.0 - 1.7))
-    np.testing.assert_allclose(decode(lit)[row, 160] / decode(IMAGE)[row, 160], 1.5, rtol=0.05)
+    np.testing.assert_allclose(decode_srgb(lit)[row, 160] / decode_srgb(IMAGE)[row, 160], 1.5, rtol=0.05)
     everything = np.array([(0, 0), (320, 0), (320, 192), (0, 192)], np.float32)
     hidden = paint_road(
         IMAGE,

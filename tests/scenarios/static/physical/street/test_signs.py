@@ -59,5 +59,5 @@ def test_what_is_refused() -> None:
         SignChange("stop", "stop")
     with pytest.raises(UnknownNameError):
         HeadLight("purple")
-    with pytest.raises(ConfigError, match="distance 1 to 60 m"):
+    with pytest.raises(ConfigError, match="give 1 to 5, 1 to 60 m"):
         HeadLight(distance=0.0)

@@ -84,5 +84,5 @@ def test_shipped_textures_lie_on_the_rear_of_their_car() -> None:
         assert 0 < top < bottom < 1
         assert worn.mask.shape == tuple(worn.colour.shape[1:])
         assert 0.3 < worn.mask.mean() < 1
-    with pytest.raises(ConfigError, match="only cars"):
+    with pytest.raises(ConfigError, match="made for a car"):
         face_print("adv-patch-yolov5n-stop-sign-twinford")

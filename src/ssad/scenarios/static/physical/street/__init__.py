@@ -1,1 +1,1 @@
-"""Attacks on the street that stays where it is: dirt on the road, projections, signs and signal heads."""
+"""Attacks that stay in their place on the street: dirt, phantoms, light into the lens, signs and signal heads."""

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 DIRT: Final = (0.05, 0.19)  # linear albedo: from wet dirt to dry dust; asphalt has 0.09
 ASPHALT_ALBEDO: Final = 0.09
-CELL: Final = (0.5, 0.1)  # m of a texel along and across the road
+CELL: Final = (0.5, 0.1)  # m: size of a texel along and across the road
 LENGTH: Final = 24.0  # m along the road
-WIDE: Final = 5.2  # m across the road: it covers the lines of the lane
-NARROW: Final = 2.9  # m: it lies between them
+COVERING_WIDTH: Final = 5.2  # m across the road: the patch covers the lines of the lane
+INNER_WIDTH: Final = 2.9  # m: the patch lies between them
 SHIPPED_PATCHES: Final = {name: Path(__file__).parent / "trained" / f"{name}.json" for name in ("over", "between")}
 PATTERNS: Final = (*SHIPPED_PATCHES, "shuffled", "random", "clean")
-EDGE: Final = 20.0  # m of the route that must lie before and behind a place
+EDGE: Final = 20.0  # m of the route behind a place; on recordings, m from the first pose to a place
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class DirtyRoad(Perturbation):
 
     Attributes:
         pattern: Trained against the lane keeper: "over", which covers the lines of the lane, or "between" them, as in
-            the source. A control: "shuffled", the texels of "over" in random order; "random" dirt over the whole range
-            of greys, which is far stronger; or "clean", an even patch as dark as the road. Or the path of a card
+            the source. A control: "shuffled", the texels of "over" in random order; "random", dirt over the whole range
+            of greys, far stronger than the patch; or "clean", an even patch as dark as the road. Or the path of a card
             (NAME.json beside NAME.png).
         distance: Place of its middle along the route, m.
         width: m across the road, of a control.
-        mirrored: Whether left and right are exchanged: it then leads to the other side.
+        mirrored: Whether left and right are exchanged, so that the patch leads to the other side.
         seed: Seed of the order, and of random dirt.
 
     Raises:
@@ -71,7 +71,7 @@ class DirtyRoad(Perturbation):
 
     pattern: str = "over"
     distance: float = 90.0
-    width: float = WIDE
+    width: float = COVERING_WIDTH
     mirrored: bool = False
     seed: int = 0
     severity: int = field(default=1, init=False)
@@ -91,7 +91,7 @@ class DirtyRoad(Perturbation):
     def name(self) -> str:  # type: ignore[override]
         """Name in tables and slices."""
         pattern = Path(self.pattern).stem if self.pattern.endswith(".json") else self.pattern
-        fields = {"mirrored": False, "distance": 90.0, "width": WIDE, "seed": 0}
+        fields = {"mirrored": False, "distance": 90.0, "width": COVERING_WIDTH, "seed": 0}
         values = {key: getattr(self, key) for key in fields}
         text = "&".join(f"{key}={values[key]:g}" for key, default in fields.items() if values[key] != default)
         base = "dirty-road" if pattern == "over" else f"dirty-road-{pattern}"
@@ -159,12 +159,12 @@ class DirtyRoad(Perturbation):
 
 
 def patch_size(albedo: Tensor) -> tuple[float, float]:
-    """Return the size along and across the road of a patch [3, H, W], m."""
+    """Return the size of a patch [3, H, W] along and across the road, m."""
     return albedo.shape[1] * CELL[0], albedo.shape[2] * CELL[1]
 
 
 def road_decal(size: tuple[float, float]) -> TextureDecal:
-    """Return a decal of texture 0 on the road: its top is far from who drives along x.
+    """Return a decal of texture 0 on the road, with its upper edge at the far end for traffic along x.
 
     Args:
         size: m along and across the road.

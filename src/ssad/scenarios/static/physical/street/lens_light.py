@@ -1,6 +1,6 @@
 """Light into the lens: a laser or a torch that is aimed at the camera, with its veil and its spot.
 
-Light that enters a lens does not all go where it belongs: a small share is scattered over the whole image. The veil
+A lens scatters a small share of the light that enters it over the whole image. The veil
 follows the equation of disability glare, L = 10 E / (angle^2 + core^2) (CIE 146:2002; L in cd/m^2, E the illuminance at
 the lens in lux, angles in degrees), times a factor of the lens. Near the source it exceeds what the sensor can hold.
 Petit et al., Remote Attacks on Automated Vehicles Sensors (Black Hat Europe 2015), blinded a camera with such lights.
@@ -18,12 +18,14 @@ import torch
 from ssad.core.driving import Frames, Generators
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.images import decode_srgb, encode_srgb
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Episode
 from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.photometry import illuminance
 from ssad.rendering.hours import SUN
 from ssad.rendering.street_edit import route_pose
@@ -36,7 +38,6 @@ from ssad.scenarios.static.perturbation import (
     TargetImages,
 )
 from ssad.scenarios.static.physical.street.dirty_road import EDGE, has_place
-from ssad.scenarios.static.physical.street.placing import decode, encode
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -45,10 +46,10 @@ if TYPE_CHECKING:
     from ssad.rendering.sensor_suite import SensorSuite
 
 GLARE: Final = 10.0  # of the equation of disability glare
-CORE: Final = 0.05  # degrees: the image of a point is no smaller
+CORE: Final = 0.05  # degrees: radius of the image of a point
 WHITE: Final = 1.28  # reflectance that fills the sensor under the light of the hour
 DARKEST: Final = 10.0  # lux of a street at night, with lamps
-POWERS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)  # of the source's own, by severity
+POWERS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)  # factor of the usual power of a source, by severity
 SOURCES: Final = ("laser", "torch")
 LASER_WATTS: Final = 0.05  # W; pointers have 0.001 to 0.005
 LASER_EFFICACY: Final = 604.0  # lm/W at 532 nm
@@ -56,7 +57,7 @@ LASER_BEAM: Final = 0.001  # rad, half angle of the widened beam
 TORCH_LUMENS: Final = 3000.0
 TORCH_BEAM: Final = 0.08  # rad, half angle
 COLOURS: Final = {"laser": (0.08, 1.0, 0.12), "torch": (1.0, 0.97, 0.90)}
-VISIBLE: Final = 150.0  # m
+MAX_DISTANCE: Final = 150.0  # m from the lens, beyond which a source is left out
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ class LensLight(Perturbation):
         height: m above the road.
         power: Optical power of a laser, W, or luminous flux of a torch, lm; None: by severity.
         beam: Half angle of the beam, rad; None: that of the source.
-        scatter: Scattered light of the lens, as a multiple of that of the eye: 0.3 for a clean one, 3 for a dirty one.
-        aim: Share of the images in which the beam meets the lens: hands shake.
+        scatter: Scattered light of the lens, as a multiple of that of the eye: 0.3 for a clean lens, 3 for a dirty one.
+        aim: Share of the images in which the beam of a shaking hand meets the lens.
         severity: 1 to 5, the power.
 
     Raises:
@@ -99,8 +100,8 @@ class LensLight(Perturbation):
         is_valid &= self.aim <= 1.0 and 1e-5 <= self.half_angle <= 1.5 and self.severity in range(1, 6)
         if not is_valid or (self.power is not None and self.power < 0.0):
             raise ConfigError(
-                "lens-light: distance, power and scatter from 0, aim from 0 to 1, beam from 1e-5 to 1.5 rad, severity "
-                "1 to 5"
+                f"{self.name}: a value is out of its range; give finite numbers: distance, power and scatter from 0, "
+                "aim from 0 to 1, beam from 1e-5 to 1.5 rad, severity 1 to 5"
             )
 
     @property
@@ -159,7 +160,7 @@ class LensLight(Perturbation):
         return suite
 
     def on_scene(self, scene: RecordedScene, victim: SceneVictim | None) -> PerturbedScene:
-        """Return the images of a scene with the source ahead of where the ego was at its start, as by day."""
+        """Return the images of a scene with the source ahead of the ego's first pose, in the light of noon."""
         cameras = [frame for frame in scene.data.frames if frame.modality == "camera"]
         place = cameras[0].ego_to_world @ upright_pose(EDGE, self.lateral, 0.0, self.height) if cameras else np.eye(4)
         scale = full_scale(SUN["noon"])
@@ -168,8 +169,8 @@ class LensLight(Perturbation):
             images = []
             for frame in frames:
                 image = read_frame_image(scene.root, frame)
-                hit = generator("lens light", scene.seed, frame.scene_token, frame.token).random() < self.aim
-                if frame.intrinsic is not None and hit:
+                beam_hits = generator("lens light", scene.seed, frame.scene_token, frame.token).random() < self.aim
+                if frame.intrinsic is not None and beam_hits:
                     camera = Camera(image.shape[1], image.shape[0], frame.intrinsic, frame.sensor_to_ego, frame.channel)
                     image = self.shine(image, camera, frame.ego_to_world, place[:3, 3], scale)
                 images.append(image)
@@ -188,7 +189,7 @@ class LensLight(Perturbation):
             camera = Camera.typical(pixels.shape[1], pixels.shape[0])
             _, top, right, bottom = truth.box[0].tolist()
             veil = self.veil(camera, np.array([right, 0.5 * (top + bottom)]), 20.0, scale)
-            lit = encode(decode(pixels) + veil)
+            lit = encode_srgb(decode_srgb(pixels) + veil)
             yield drive, torch.from_numpy(np.moveaxis(lit, -1, 0).copy())[None].to(image) / 255.0, truth
 
     def shine(self, image: U8, camera: Camera, ego_to_world: F64, place: F64, scale: float) -> U8:
@@ -204,10 +205,10 @@ class LensLight(Perturbation):
         to_camera = np.linalg.inv(ego_to_world @ camera.to_ego)
         right, down, depth = (to_camera @ np.append(place, 1.0))[:3]
         distance = float(np.sqrt(right * right + down * down + depth * depth))
-        if depth < 0.5 or distance > VISIBLE:
+        if depth < 0.5 or distance > MAX_DISTANCE:
             return image
         pixel_column, pixel_row, _ = camera.intrinsic @ np.array([right, down, depth]) / depth
-        return encode(decode(image) + self.veil(camera, np.array([pixel_column, pixel_row]), distance, scale))
+        return encode_srgb(decode_srgb(image) + self.veil(camera, np.array([pixel_column, pixel_row]), distance, scale))
 
     def veil(self, camera: Camera, pixel: F64, distance: float, scale: float) -> F32:
         """Return the linear light [H, W, 3] that a source adds to an image, 1 where it fills the sensor.
@@ -227,9 +228,9 @@ class LensLight(Perturbation):
         source_ray /= np.linalg.norm(source_ray)
         angle_degrees = np.degrees(np.arccos(np.clip(pixel_rays @ source_ray, -1.0, 1.0)))
         luminance = self.scatter * GLARE * self.lux(distance) / (angle_degrees * angle_degrees + CORE * CORE)
-        # Colours share the luminance: a saturated source_colour fills its channel sooner, and then spills to white.
+        # Colours share the luminance: a saturated colour fills its channel sooner.
         source_colour = np.array(COLOURS[self.source])
-        colour_luminance = float(source_colour @ [0.2126, 0.7152, 0.0722])
+        colour_luminance = float(source_colour @ TO_LUMINANCE)
         return np.asarray((luminance / scale)[..., None] * source_colour / colour_luminance, np.float32)
 
 

@@ -1,7 +1,7 @@
 """Phantoms: pictures of people and signs that a projector throws onto the road or onto a screen beside it.
 
 Source: Nassi et al., Phantom of the ADAS: Securing Advanced Driver-Assistance Systems from Split-Second Phantom Attacks
-(CCS 2020): depthless objects, projected or shown for a moment, that a camera takes for real ones.
+(CCS 2020): objects without depth, projected or shown for a moment, that a system takes for real ones.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.frames import Camera
+from ssad.core.images import decode_srgb
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
@@ -41,7 +42,7 @@ from ssad.scenarios.static.perturbation import (
 )
 from ssad.scenarios.static.physical.lights.light import aimed_poses, first_array
 from ssad.scenarios.static.physical.street.dirty_road import EDGE, has_place
-from ssad.scenarios.static.physical.street.placing import behind_target, decode, painted_scene
+from ssad.scenarios.static.physical.street.placing import behind_target, painted_scene
 
 if TYPE_CHECKING:
     from ssad.core.detections import Truth
@@ -56,13 +57,13 @@ PICTURES: Final = {
 }
 BLANK: Final = "blank"
 SURFACES: Final = ("road", "screen")
-LUMENS: Final = (20.0, 60.0, 200.0, 600.0, 2000.0)  # of a white picture, by severity; pocket projectors have 100
+LUMENS: Final = (20.0, 60.0, 200.0, 600.0, 2000.0)  # flux of a white picture by severity; a pocket projector: 100
 TEXELS: Final = 96  # along the longer side of a picture
-STRETCH: Final = 4.0  # times: a picture on the road is longer, so that it looks less flat from the ego
+STRETCH: Final = 4.0  # factor of the length of a picture on the road, which the ego sees foreshortened
 SCREEN_WIDTH, SCREEN_HEIGHT = 2.4, 2.4  # m
 SCREEN: Final = Material("screen", (0.75, 0.75, 0.73))
-PROJECTOR: Final = (6.0, 5.0)  # m before the picture and above the road; a drone, or a mast
-LEAK: Final = 0.001  # light of black parts, share of white
+PROJECTOR: Final = (6.0, 5.0)  # m before a screen, and m above the road (on a drone or a mast)
+LEAK: Final = 0.001  # light that black parts of a picture pass, as a share of white
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,11 @@ class Phantom(Perturbation):
     """Picture of a person or a sign in the light of a projector.
 
     Attributes:
-        picture: See `PICTURES`; "blank": a control that spreads the light of the person over the same surface.
+        picture: Name in `PICTURES`, or "blank": a control that spreads the light of the person evenly.
         onto: "road": in the middle of the lane, stretched along it; "screen": a pale board beside the road, which
-            stands there with the control too.
+            also stands there under the control.
         distance: Place along the route, m.
-        lateral: m to the left of the middle of the lane; None: in it on the road, 3.2 m to the right on a screen.
+        lateral: m to the left of the middle of the lane; None: 0 on the road, 3.2 m to the right for a screen.
         lumens: Luminous flux of a white picture; None: by severity.
         hour: Hour of the episode (`ssad.rendering.hours.HOURS`); by day a projector shows nothing.
         severity: 1 to 5, the luminous flux.
@@ -101,7 +102,10 @@ class Phantom(Perturbation):
             raise unknown_name("hour", self.hour, HOURS)
         lumens = LUMENS[0] if self.lumens is None else self.lumens
         if self.severity not in range(1, 6) or not 0.0 <= self.distance < 1e5 or not 0.0 <= lumens <= 1e6:
-            raise ConfigError("phantom: severity 1 to 5, distance in m from 0, and 0 to 1e6 lumens")
+            raise ConfigError(
+                f"phantom: severity {self.severity}, distance {self.distance:g} m, {lumens:g} lumens; give 1 to 5, a "
+                "distance from 0, and 0 to 1e6 lumens"
+            )
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -220,7 +224,7 @@ def screen_mesh() -> Mesh:
 
 @lru_cache(maxsize=8)
 def _picture_light(picture: str) -> Tensor:
-    """Return the share of the light that each texel of a picture passes [3, H, W]: the body before black."""
+    """Return the share of the light that each texel of a picture passes [3, H, W]: a body before a black background."""
     body_kind, body_style, (picture_width, picture_height) = PICTURES[picture]
     body_generator = generator("phantom", picture)
     is_sign = body_kind.endswith("sign")
@@ -231,7 +235,7 @@ def _picture_light(picture: str) -> Tensor:
     column_count = max(round(row_count * picture_width / picture_height), 8)
     camera_distance = 30.0
     focal_length = row_count / picture_height * camera_distance
-    # A sign is shown_light without its post: the picture ends below the plate.
+    # A sign is shown without its post: the picture ends below the plate.
     centre_height = body_size[2] - 0.5 * picture_height + 0.05 if is_sign else 0.5 * picture_height
     intrinsic = np.array([[focal_length, 0.0, column_count / 2], [0.0, focal_length, row_count / 2], [0.0, 0.0, 1.0]])
     camera_pose = upright_pose(camera_distance, 0.0, np.pi, centre_height) @ np.array(
@@ -242,7 +246,7 @@ def _picture_light(picture: str) -> Tensor:
         picture_camera, camera_pose, (SceneObject(0, np.eye(4), (0.45, 0.1, 0.08), 1),), SceneWeather(0.9, 0.0, 0.3)
     )
     rendering = render(body_scene, [picture_view])
-    linear_image = decode(np.asarray(rendering.image[0]))
+    linear_image = decode_srgb(np.asarray(rendering.image[0]))
     shown_light: F32 = np.where((np.asarray(rendering.tag[0]) == 1)[..., None], linear_image, 0.0).astype(np.float32)
     peak_light = (
         max(float(np.quantile(shown_light[shown_light > 0.0], 0.98)), 1e-3) if (shown_light > 0.0).any() else 1.0

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ssad.core.boxes import UNIT_CORNERS
 from ssad.core.frames import Camera
+from ssad.core.images import decode_srgb, encode_srgb
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F32, F64, U8
 from ssad.datasets.nuscenes.files import read_frame_image
@@ -20,8 +21,8 @@ from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.perturbation import PerturbedScene, RecordedScene
 
-ROAD_ALBEDO: Final = 0.09  # of the asphalt that a recorded image is taken to show
-NEAREST: Final = 0.5  # m: nearer points of an outline are behind the camera
+ROAD_ALBEDO: Final = 0.09  # assumed albedo of the asphalt in a recorded image
+MIN_DEPTH: Final = 0.5  # m before the camera, below which points are not projected
 
 
 def behind_target(edit: SceneEdit, distance: float) -> SceneEdit:
@@ -105,7 +106,7 @@ def paint_road(  # noqa: PLR0917  # plain values
         place: Pose of the middle of the texture [4, 4]: x along the road, y to the left, on the road.
         size: m along and across the road.
         texture: Linear RGB [h, w, 3].
-        light: See `painted_scene`.
+        light: Light of a white texel, as in `painted_scene`.
         opacity: [h, w].
         hidden: Outlines [N, 2], px, of what stands before it.
     """
@@ -115,7 +116,7 @@ def paint_road(  # noqa: PLR0917  # plain values
     world_points = np.column_stack([road_corners, np.zeros(4), np.ones(4)]) @ place.T
     to_camera = np.linalg.inv(ego_to_world @ camera.to_ego)
     camera_points = (world_points @ to_camera.T)[:, :3]
-    if (camera_points[:, 2] < NEAREST).any():
+    if (camera_points[:, 2] < MIN_DEPTH).any():
         return image  # partly behind the camera
     pixel_corners = camera_points @ camera.intrinsic.T
     pixel_corners = (pixel_corners[:, :2] / pixel_corners[:, 2:]).astype(np.float32)
@@ -131,24 +132,11 @@ def paint_road(  # noqa: PLR0917  # plain values
     warped_opacity = cv2.warpPerspective(opacity.astype(np.float32), homography, frame_size, flags=cv2.INTER_LINEAR)
     for hidden_outline in hidden:
         cv2.fillConvexPoly(warped_opacity, np.rint(hidden_outline).astype(np.int32), 0.0)
-    road_light = decode(image)
+    road_light = decode_srgb(image)
     changed_light = (
         road_light * warped_texture / ROAD_ALBEDO if light is None else road_light * (1.0 + light * warped_texture)
     )
-    return encode(road_light + warped_opacity[..., None] * (changed_light - road_light))
-
-
-def decode(image: U8) -> F32:
-    """Return the linear values of an sRGB image, 0 to 1."""
-    share = image.astype(np.float32) / 255.0
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def encode(linear: F32) -> U8:
-    """Return the sRGB image of linear values; what is above 1 is full."""
-    clipped = np.clip(linear, 0.0, 1.0)
-    share = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * share).astype(np.uint8)
+    return encode_srgb(road_light + warped_opacity[..., None] * (changed_light - road_light))
 
 
 def _outlines(scene: RecordedScene, frame: SensorFrame, camera: Camera) -> list[F32]:
@@ -158,7 +146,7 @@ def _outlines(scene: RecordedScene, frame: SensorFrame, camera: Camera) -> list[
     in_camera = (corners - (frame.ego_to_world @ camera.to_ego)[:3, 3]) @ (frame.ego_to_world @ camera.to_ego)[:3, :3]
     outlines = []
     for box in in_camera.reshape(-1, len(UNIT_CORNERS), 3):
-        if (box[:, 2] > NEAREST).all():
+        if (box[:, 2] > MIN_DEPTH).all():
             pixels = box @ camera.intrinsic.T
             outlines.append(cv2.convexHull((pixels[:, :2] / pixels[:, 2:]).astype(np.float32))[:, 0])
     return outlines

@@ -1,4 +1,4 @@
-"""Removal and change of signs, and light on signal heads: only sensors are told, and the map keeps its rules."""
+"""Removal and change of signs, and light on signal heads: sensors see the change, and the map keeps its rules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 NOTHING: Final = "nothing"
 SIGNS: Final = {"stop": "stop_sign", "yield": "yield_sign"}
-NEAR: Final = 25.0  # m from a route within which its signs and signal heads stand
+ROUTE_DISTANCE: Final = 25.0  # m from a route within which a sign or signal head belongs to it
 HEAD_LUMENS: Final = (30.0, 100.0, 300.0, 1000.0, 3000.0)  # by severity
 HEAD_LIGHTS: Final = {"red": (1.0, 0.03, 0.02), "green": (0.03, 1.0, 0.25), "white": (1.0, 0.98, 0.95)}
 HEAD_SIZE: Final = (0.3, 0.9)  # m, width and height that the light covers
@@ -32,14 +32,14 @@ HEAD_SIZE: Final = (0.3, 0.9)  # m, width and height that the light covers
 
 @dataclass(frozen=True)
 class SignChange(Perturbation):
-    """Signs of the town that are gone, or show something else.
+    """Change of the signs of a town: they are removed, or become signs of another kind.
 
     Attributes:
         sign: Signs that change: stop or yield.
-        into: Sign that stands there: stop, yield, or "nothing", where the whole sign is gone.
+        into: Sign that stands in their place: stop, yield, or "nothing".
 
     Raises:
-        ConfigError: A sign is unknown, or stays the same.
+        ConfigError: A sign is unknown, or would stay the same.
     """
 
     sign: str = "yield"
@@ -53,7 +53,7 @@ class SignChange(Perturbation):
         if self.into not in (*SIGNS, NOTHING):
             raise unknown_name("sign", self.into, (*SIGNS, NOTHING))
         if self.into == self.sign:
-            raise ConfigError(f"sign-change: {self.sign} into {self.into} changes nothing")
+            raise ConfigError(f"sign-change: {self.sign} into {self.into} changes nothing; choose another `into`")
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -73,7 +73,7 @@ class SignChange(Perturbation):
         return EGO if route is not None and near_route(route.xy.astype(np.float64), places) else None
 
     def body(self) -> Mesh | None:
-        """Return the sign that stands in place of each; None: it is gone."""
+        """Return the sign that stands in place of each; None if they are removed."""
         if self.into == NOTHING:
             return None
         kind = SIGNS[self.into]
@@ -81,13 +81,13 @@ class SignChange(Perturbation):
         return make_body(kind, style="standard", size=size, generator=generator("changed sign", kind))
 
     def in_loop(self, suite: SensorSuite, *, target: int, victim: Any, seed: int) -> SensorSuite:
-        """Return the suite whose cameras and LiDARs are told of the changed signs."""
+        """Return the suite whose cameras and LiDARs see the changed signs."""
         return suite.with_street_edit(StreetEdit(signs={SIGNS[self.sign]: self.body()}))
 
 
 @dataclass(frozen=True)
 class HeadLight(Perturbation):
-    """Light on the signal heads: dark lenses seem lit, and lit ones drown.
+    """Light on the signal heads: dark lenses seem lit, and lit ones lose their contrast.
 
     The light of a lamp in front of a head adds to that of its lenses, as the low sun does (sun phantom effect).
 
@@ -112,7 +112,10 @@ class HeadLight(Perturbation):
             raise unknown_name("colour", self.colour, HEAD_LIGHTS)
         flux = HEAD_LUMENS[0] if self.lumens is None else self.lumens
         if self.severity not in range(1, 6) or not 1.0 <= self.distance <= 60.0 or not 0.0 <= flux <= 1e6:
-            raise ConfigError("head-light: severity 1 to 5, distance 1 to 60 m, and 0 to 1e6 lumens")
+            raise ConfigError(
+                f"head-light: severity {self.severity}, distance {self.distance:g} m, {flux:g} lumens; give 1 to 5, "
+                "1 to 60 m and 0 to 1e6 lumens"
+            )
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -145,7 +148,7 @@ class HeadLight(Perturbation):
 
 
 def near_route(route: F64, places: F64) -> bool:
-    """Return True if one of some places [M, 2] lies within `NEAR` of a route [N, 2]."""
+    """Return True if any of the places [M, 2] lies within `ROUTE_DISTANCE` of a route [N, 2]."""
     if not len(places):
         return False
-    return bool((np.hypot(*np.moveaxis(places[:, None] - route[None], -1, 0)).min(1) < NEAR).any())
+    return bool((np.hypot(*np.moveaxis(places[:, None] - route[None], -1, 0)).min(1) < ROUTE_DISTANCE).any())

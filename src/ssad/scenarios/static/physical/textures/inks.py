@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.types import F64
-from ssad.rendering.camera.texture import PRINTABLE, to_linear, to_printable
+from ssad.rendering.camera.texture import PRINTABLE, to_linear, to_printable, to_srgb
 from ssad.scenarios.static.physical.textures.printing import lab_of
 
 CHARACTERISATION: Final = "FOGRA39"
@@ -151,7 +151,7 @@ def project_onto_gamut(colour: Tensor) -> Tensor:
 
 
 def _nearest_tones(colours: Tensor) -> Tensor:
-    """Return tones [N, 4] for colours [N, 3] in sRGB: the best of a lattice, then of ever finer steps around it."""
+    """Return tones [N, 4] for colours [N, 3] in sRGB: the nearest, without black ink where that is enough."""
     target = _lab(_albedo(colours.T)).T
     tones = _search(target, black=False)
     is_reached = _residual(tones, target).norm(dim=1) <= 0.5 * TOLERANCE
@@ -227,6 +227,4 @@ def _lab(albedo: Tensor) -> Tensor:
 def _colour_of(albedo: Tensor) -> Tensor:
     """Return the sRGB in 0 to 1 that `albedo_of` maps to an albedo; beyond its range, its border."""
     darkest, brightest = PRINTABLE
-    linear = ((albedo - darkest) / (brightest - darkest)).clamp(0.0, 1.0)
-    # The clamped root keeps the unused branch of `where` finite.
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+    return to_srgb(((albedo - darkest) / (brightest - darkest)).clamp(0.0, 1.0))

@@ -1,8 +1,8 @@
 """Textures pasted onto cars in photographs: a planar homography of the face that the camera sees.
 
 The face is the rear or the front of a car's 3D box, or its 2D box where there is none. The texture lies where it lies
-on the body that it was made for, and leaves free what is not painted there (lamps, plate). The photograph tells the
-light on the print: that under which the surroundings of the car have the mean reflectance of a grey world.
+on the body that it was made for, and leaves lamps and plate free. The light on the print is estimated: under it the
+surroundings of the car have the mean reflectance of a grey world.
 
 Sources: Hartley and Zisserman, Multiple View Geometry (2004), 2.3 (homography of a plane); Buchsbaum, A spatial
 processor model for object colour perception (1980), for the grey world.
@@ -21,7 +21,9 @@ from torch import Tensor
 
 from ssad.core.boxes import camera_axes
 from ssad.core.errors import ConfigError
+from ssad.core.images import encode_srgb
 from ssad.core.types import F32, F64, U8, Bool
+from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.meshes.mesh import Mesh
@@ -30,16 +32,16 @@ from ssad.scenarios.static.physical.textures.carrier import albedo_of
 from ssad.scenarios.static.physical.textures.perturbation import Texture
 
 GREY_WORLD: Final = 0.18  # mean reflectance of outdoor scenes
-SURROUNDINGS: Final = 2.0  # sides of the part of a photograph that tells the light, in sides of the car's box
+SURROUNDINGS: Final = 2.0  # sides of the part of a photograph that the light is estimated from, in sides of the box
 SAMPLES: Final = 4  # samples per pixel and direction of a pasted print
 MIN_FACING: Final = 0.5  # least cosine between the normal of a face and the direction to the camera
-MAX_RATIO: Final = 1.4  # width by height of a 2D box from which on a car is taken to be seen from the side
+MAX_RATIO: Final = 1.4  # width by height of a 2D box from which on a car counts as seen from the side
 PANEL: Final = "rear"
 
 
 @dataclass(frozen=True, slots=True)
 class FacePrint:
-    """What of a texture lies on the rear of a car, and where.
+    """Part of a texture that lies on the rear of a car, and its place.
 
     Attributes:
         colour: sRGB [3, H, W] in 0 to 1.
@@ -55,7 +57,7 @@ class FacePrint:
 
 @lru_cache(maxsize=32)
 def face_print(texture: str) -> FacePrint:
-    """Return what of a texture lies on the rear of the car that it was made for.
+    """Return the part of a texture that lies on the rear of the car that it was made for.
 
     Args:
         texture: Name or file, as for `Texture`.
@@ -67,16 +69,16 @@ def face_print(texture: str) -> FacePrint:
     printed = Texture(texture).printed_texture()
     target = parse_target(printed.target)
     if not isinstance(target, TargetCar):
-        raise ConfigError(f"texture '{texture}': it is made for {printed.target}; only cars in photographs wear one")
+        raise ConfigError(f"texture '{texture}': it is made for {printed.target}; choose one that is made for a car")
     body_mesh = target.mesh()
     surface = printed.on(body_mesh)
     if not isinstance(surface.layer, TextureLayer):
-        raise ConfigError(f"texture '{texture}': it lies beside the car; only what is on its rear can be pasted")
+        raise ConfigError(f"texture '{texture}': it lies beside the car; choose one that lies on its rear")
     panel = body_mesh.panel_rectangle(PANEL)
     u0, v0, u1, v1 = surface.layer.rectangle
     atlas_part = (max(u0, panel[0]), max(v0, panel[1]), min(u1, panel[2]), min(v1, panel[3]))
     if atlas_part[2] <= atlas_part[0] or atlas_part[3] <= atlas_part[1]:
-        raise ConfigError(f"texture '{texture}': it does not lie on the {PANEL} of the car")
+        raise ConfigError(f"texture '{texture}': it does not lie on the {PANEL} of the car; choose one that does")
     _, pixel_height, pixel_width = printed.colour.shape
     left, right = (round((u - u0) / (u1 - u0) * pixel_width) for u in (atlas_part[0], atlas_part[2]))
     top, bottom = (round((v - v0) / (v1 - v0) * pixel_height) for v in (atlas_part[1], atlas_part[3]))
@@ -174,26 +176,20 @@ def paste(image: U8, colour: Tensor, mask: Bool, quad: F64, *, light: F32) -> U8
     window = np.s_[lower_corner[1] : upper_corner[1], lower_corner[0] : upper_corner[0]]
     lit = np.minimum(averaged[..., :3] * light, averaged[..., 3:])
     pasted = image.copy()
-    pasted[window] = _srgb(_linear(image[window]) * (1 - averaged[..., 3:]) + lit)
+    pasted[window] = encode_srgb(_linear(image[window]) * (1 - averaged[..., 3:]) + lit)
     return pasted
 
 
 def light_on(image: U8, box: F64) -> F32:
-    """Return the light on a car, linear RGB [3]: that under which its surroundings have the mean of a grey world."""
+    """Return the light on a car, linear RGB [3], under which its surroundings have the mean of a grey world."""
     pixel_height, pixel_width = image.shape[:2]
     centre, sides = (box[:2] + box[2:]) / 2, SURROUNDINGS * (box[2:] - box[:2]) / 2
     lower_corner = np.clip(np.floor(centre - sides).astype(int), 0, (pixel_width - 1, pixel_height - 1))
     upper_corner = np.clip(np.ceil(centre + sides).astype(int), lower_corner + 1, (pixel_width, pixel_height))
     mean = _linear(image[lower_corner[1] : upper_corner[1], lower_corner[0] : upper_corner[0]]).reshape(-1, 3).mean(0)
     # Brightness alone: the colours of few objects say little about the colour of the light.
-    return np.full(3, mean @ np.array([0.2126, 0.7152, 0.0722]) / GREY_WORLD, np.float32)
+    return np.full(3, mean @ TO_LUMINANCE / GREY_WORLD, np.float32)
 
 
 def _linear(image: U8) -> F32:
     return np.asarray(to_linear(torch.from_numpy(image.astype(np.float32) / 255)).numpy())
-
-
-def _srgb(linear: F32) -> U8:
-    clipped = np.clip(linear, 0.0, 1.0)
-    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * encoded), np.uint8)
