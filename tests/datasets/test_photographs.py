@@ -77,6 +77,7 @@ def test_what_is_missing_is_one_line(tmp_path: Path) -> None:
         (coco, "", "several files of annotations"),
         (coco, "test", "no split 'test'"),
         (kitti, "test", "no ImageSets/test.txt"),
+        (coco / "annotations" / "instances_val2017.json", "test", "split .test. with a single file"),
     ):
         with pytest.raises(ConfigError, match=words) as error:
             read_photographs(path, split)

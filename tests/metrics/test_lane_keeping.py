@@ -63,6 +63,15 @@ def test_the_time_of_a_departure_counts_from_when_the_place_is_in_view(drive: tu
     assert lane_metrics(trace, town, [])["lane_departure"] == 0.0
 
 
+def test_a_drive_that_never_sees_the_place_departs_from_nothing(drive: tuple[EpisodeTrace, LaneGraph]) -> None:
+    trace, town = drive
+    changed = moved(trace, np.full(len(trace.x), 2.0))
+    assert lane_metrics(changed, town, [], place=60.0, view=30.0)["lane_departure"] == 1.0
+    metrics = lane_metrics(changed, town, [], place=1000.0, view=30.0)
+    assert metrics["lane_deviation"] == pytest.approx(2.0, abs=0.02)
+    assert np.isnan([metrics[name] for name in ("lane_deviation_max", "lane_departure", "departure_time")]).all()
+
+
 def test_a_body_that_turns_needs_more_room(drive: tuple[EpisodeTrace, LaneGraph]) -> None:
     position = lane_position(*drive)
     assert not is_outside(position, 4.0, 1.9).any()

@@ -136,7 +136,10 @@ def read_photographs(path: Path, split: str = "") -> PhotographSet:
         StoreError: A file leads out of the folder.
     """
     if path.is_file():
-        return _read_json_files([path], split)
+        photographs = _read_json_files([path], split)
+        if split and photographs.form != "bdd100k":
+            raise ConfigError(f"{path}: split {split!r} with a single file of form {photographs.form}; leave one out")
+        return photographs
     if not path.is_dir():
         raise ConfigError(f"{path}: no such folder; give a folder of annotated photographs")
     if any(path.glob("*/sample.json")):

@@ -107,20 +107,22 @@ def lane_metrics(
 
     Returns:
         lane_deviation: Mean distance to the middle of the lane, m.
-        lane_deviation_max: Greatest distance, m.
-        lane_departure: 1 if the body crosses a line of the lane, else 0.
+        lane_deviation_max: Greatest distance from when the place comes into view, m.
+        lane_departure: 1 if the body crosses a line of the lane after that, else 0.
         departure_time: s from when the place comes into view to the first crossing after it; NaN without one.
         lane_error: Mean error of the believed middle of the lane beside the ego, m; NaN if it believed in none.
         lane_seen: Share of the steps in which it detected the lane.
+        The greatest distance and the departure are NaN if the drive ends before the place comes into view.
     """
     position = lane_position(trace, graph)
     outside = is_outside(position, float(trace.length[0]), float(trace.width[0]))
-    start = 0 if place is None else int((position.along >= place - view).argmax())
+    in_view = position.along >= (-np.inf if place is None else place - view)
+    start = int(in_view.argmax()) if in_view.any() else len(in_view)
     crossings = np.flatnonzero(outside[start:])
     metrics = {
         "lane_deviation": float(np.abs(position.deviation).mean()),
-        "lane_deviation_max": float(np.abs(position.deviation[start:]).max()),
-        "lane_departure": float(len(crossings) > 0),
+        "lane_deviation_max": float(np.abs(position.deviation[start:]).max(initial=0.0)) if in_view.any() else np.nan,
+        "lane_departure": float(len(crossings) > 0) if in_view.any() else np.nan,
         "departure_time": float(crossings[0]) * trace.dt if len(crossings) else float("nan"),
     }
     lane_errors, detected_count = [], 0

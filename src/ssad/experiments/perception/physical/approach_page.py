@@ -54,7 +54,7 @@ class ApproachGroup:
         return list(self.clean["axis"])
 
     def control_at(self, distance: float, metric: str, attack: str | None = None) -> Line | None:
-        """Return the strongest control at a distance, of all draws; None without controls.
+        """Return the strongest control that was scored at a distance, of all draws; None without one.
 
         Args:
             distance: The distance, m.
@@ -62,7 +62,8 @@ class ApproachGroup:
             attack: Attack whose controls count; None for all controls.
         """
         controls = [line for line in self.controls if attack is None or learns_nothing(line["attack"], attack)]
-        return min(controls, key=lambda line: float(_cell(line, distance)[metric] or 0.0), default=None)
+        scored = [line for line in controls if _cell(line, distance)[metric] is not None]
+        return min(scored, key=lambda line: float(_cell(line, distance)[metric]), default=None)
 
     def proves_nothing(self, attack: Line, distance: float, metric: str = "AP50") -> bool:
         """Return whether some control hides as much as an attack at a distance.
