@@ -50,11 +50,13 @@ def measure(data: Path, archive: Path | None, name: str, out: Path) -> None:
     records: list[Mapping[str, Any]] = []
     identity: Mapping[str, Any] = {}
     weights: dict[str, str] = {}
+    settings: dict[str, Any] = {}
     # Textures are made for 2D detectors; 3D ones are shown the clean photographs.
     for suite, changes in (("reality", {"detectors": flat}), (str(SOLID), {})):
         results = ssad.run(suite, set={"data": str(data), **changes}, out=out / Path(suite).stem, workers=1)
         records += [row for row in results.rows if row["status"] == "ok"]
         identity = results.header["data"]
+        settings = settings or {key: results.header["suite"][key] for key in ("score", "draws", "wearer_height")}
         weights |= {key.rpartition("@")[2]: value for key, value in results.header["weights"].items()}
     stored = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     entry = {
@@ -62,7 +64,7 @@ def measure(data: Path, archive: Path | None, name: str, out: Path) -> None:
         "commit": commit(),
         "torch": torch.__version__.partition("+")[0],
         "weights": weights,
-        "score": 0.25,
+        **settings,
         "rows": [
             {
                 key: row.get(key)
@@ -241,10 +243,10 @@ def write_page() -> None:
             "",
             "### Textures and their controls on the cars",
             "",
-            "Each texture is pasted onto the rear, or the front, of every car that shows it: at least 40 px high, not "
-            "cut, not behind another object. Random and shuffled squares are means of three draws. Where a control "
-            "hides as much as the texture, the texture proves nothing. Fewer than five photographs with such cars have "
-            "no interval.",
+            "Each texture is pasted onto the rear, or the front, of every car that shows it: at least "
+            f"{entry['wearer_height']:g} px high, not cut, not behind another object. Random and shuffled squares are "
+            f"means of {entry['draws']} draws. Where a control hides as much as the texture, the texture proves "
+            "nothing. Fewer than five photographs with such cars have no interval.",
             "",
             *texture_table(entry),
         ]
