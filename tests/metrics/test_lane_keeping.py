@@ -87,7 +87,7 @@ def test_errors_of_the_camera_are_those_of_the_middle_of_the_lane(drive: tuple[E
     assert lane_metrics(changed, town, [(1.0, right)])["lane_error"] == pytest.approx(0.0, abs=0.02)
     metrics = lane_metrics(changed, town, [(1.0, right), (2.0, wrong), (3.0, None), (4.0, None)])
     assert metrics["lane_error"] == pytest.approx(0.2, abs=0.02)
-    assert metrics["lane_seen"] == 0.25
+    assert metrics["lane_detection_rate"] == 0.25
     assert np.isnan(lane_metrics(changed, town, [])["lane_error"])
 
 

@@ -111,7 +111,7 @@ def lane_metrics(
         lane_departure: 1 if the body crosses a line of the lane after that, else 0.
         departure_time: s from when the place comes into view to the first crossing after it; NaN without one.
         lane_error: Mean error of the believed middle of the lane beside the ego, m; NaN if it believed in none.
-        lane_seen: Share of the steps in which it detected the lane.
+        lane_detection_rate: Share of the steps in which it detected the lane.
         The greatest distance and the departure are NaN if the drive ends before the place comes into view.
     """
     position = lane_position(trace, graph)
@@ -135,7 +135,7 @@ def lane_metrics(
             )
             detected_count += perceived_lane.confidence >= LANE_CONFIDENCE
     metrics["lane_error"] = float(np.mean(lane_errors)) if lane_errors else float("nan")
-    metrics["lane_seen"] = detected_count / max(len(lanes), 1)
+    metrics["lane_detection_rate"] = detected_count / max(len(lanes), 1)
     return metrics
 
 

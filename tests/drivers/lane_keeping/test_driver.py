@@ -73,7 +73,7 @@ def test_it_keeps_the_middle_of_the_drawn_lane() -> None:
     assert trace.speed[-1, 0] > 8.0
     assert metrics["lane_deviation_max"] < 0.25
     assert metrics["lane_departure"] == 0.0
-    assert metrics["lane_seen"] == 1.0
+    assert metrics["lane_detection_rate"] == 1.0
     assert metrics["lane_error"] < 0.2
     assert len(recorder.images(0)) > 10
 

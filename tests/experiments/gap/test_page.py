@@ -141,7 +141,7 @@ def test_lane_keepers_have_a_table_and_a_figure(run: Run, tmp_path: Path) -> Non
             "lane_departure": float(is_led_astray),
             "departure_time": 1.5 if is_led_astray else None,
             "lane_error": 0.1,
-            "lane_seen": 1.0,
+            "lane_detection_rate": 1.0,
         }
         course = {"along": [0.0, 2.0], "deviation": [0.0, largest], "margin": [0.8, 0.8]}
         spec = {"repetition": 0, "scenario": {"name": "road"}}

@@ -128,8 +128,8 @@ class Gap(ScenarioKind):
         Column("lane_deviation_max", "greatest distance to it", "m", "lower", limits=NOT_NEGATIVE),
         Column("lane_departure", "share of the drives that leave the lane", "", "lower", limits=SHARE),
         Column("departure_time", "time to the departure from the lane", "s", "higher", limits=NOT_NEGATIVE),
-        Column("lane_error", "error of the middle of the lane found", "m", "lower", limits=NOT_NEGATIVE),
-        Column("lane_seen", "share of the steps in which the lane was found", "", "higher", limits=SHARE),
+        Column("lane_error", "error of the detected middle of the lane", "m", "lower", limits=NOT_NEGATIVE),
+        Column("lane_detection_rate", "share of the steps in which the lane was detected", "", "higher", limits=SHARE),
     )
     factors = ("system", "perturbation", "severity")
     metric_limits = LIMITS

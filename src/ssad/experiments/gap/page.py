@@ -62,13 +62,13 @@ LANES = {
     "lane_deviation": "from the middle, m",
     "lane_deviation_max": "at most, m",
     "lane_error": "error of the camera, m",
-    "lane_seen": "lane found",
+    "lane_detection_rate": "lane detected",
 }
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
 BOUNDED = (
     *("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40"),
-    *("lane_departure", "lane_seen"),
+    *("lane_departure", "lane_detection_rate"),
 )
 CONDITION = {
     "System": field("system"),
