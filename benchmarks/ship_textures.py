@@ -30,7 +30,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
     run = load_run(folder)
     suite, weights = run.suite, run.header["weights"]
     margins = {row.head[:3]: lower(row.cells[2]) for row in margin_table(PhysicalRun(run)).rows}
-    found: dict[str, tuple[Mapping[str, Any], TextureCard]] = {}
+    textures: dict[str, tuple[Mapping[str, Any], TextureCard]] = {}
     for line in run.lines:
         own = line["status"] == "ok" and line["view"] == "drive" and line["detector"] == line["source"]
         attack = line["attack"].replace(", ", "-").replace(" ", "-")
@@ -67,13 +67,13 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         )
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"
-        if name in found:
-            print(f"{name}: {spec['options']} ships, not {found[name][1].options}")
-        found[name] = (line, card)
+        if name in textures:
+            print(f"{name}: {spec['options']} ships, not {textures[name][1].options}")
+        textures[name] = (line, card)
     make_folder(SHIPPED)
-    for name, (line, card) in found.items():
+    for name, (line, card) in textures.items():
         save_texture(SHIPPED / name, read_image(folder / line["artefacts"]["texture"]), card)
-    return sorted(found)
+    return sorted(textures)
 
 
 def main() -> None:

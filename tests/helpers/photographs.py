@@ -117,18 +117,18 @@ class OrangeDetector:
     name, task, classes = "orange", "2d", ("car", "pedestrian")
 
     def predict(self, images: Any, intrinsic: Any = None, *, threshold: float | None = None) -> list[Detections]:
-        found = []
+        detections = []
         for image in images:
             is_orange = (image[0] > 0.9) & (image[1] > 0.4) & (image[1] < 0.55) & (image[2] < 0.2)
             rows, columns = is_orange.nonzero(as_tuple=True)
             if not len(rows):
-                found.append(Detections(torch.zeros(0), torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4)))
+                detections.append(Detections(torch.zeros(0), torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4)))
                 continue
             corners = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
             box = torch.tensor([[float(corner) for corner in corners]])
             share = len(rows) / (box[0, 2:] - box[0, :2]).prod()
-            found.append(Detections(share[None], torch.zeros(1, dtype=torch.int64), box))
-        return found
+            detections.append(Detections(share[None], torch.zeros(1, dtype=torch.int64), box))
+        return detections
 
     def dense(self, images: Any, intrinsic: Any = None) -> Dense:
         raise NotImplementedError

@@ -37,9 +37,9 @@ def test_brightness_is_that_of_the_ground_and_unknown_outside_the_image() -> Non
     road_map = RoadMap(rig_camera("CAM_FRONT", 640), GRID)
     image = np.zeros((3, 360, 640), np.uint8)
     image[0], image[1] = 60, 100
-    seen = road_map.brightness(image)
-    assert np.isnan(seen[0, 0])  # 8 m aside at 7 m ahead
-    assert np.nanmin(seen) == np.nanmax(seen) == 80.0
+    brightness = road_map.brightness(image)
+    assert np.isnan(brightness[0, 0])  # 8 m aside at 7 m ahead
+    assert np.nanmin(brightness) == np.nanmax(brightness) == 80.0
     with pytest.raises(ConfigError, match="an image of shape"):
         road_map.brightness(image[:, :100])
 

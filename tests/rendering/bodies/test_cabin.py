@@ -101,5 +101,12 @@ def test_a_car_from_behind_has_what_cars_have(style: str) -> None:
 def test_details_do_not_reach_far_bodies() -> None:
     far = make_body("car", style="sedan", generator=generator("cabin", "sedan"), detail=0)
     assert {material.name for material in far.materials} <= {
-        "paint", "glass", "trim", "underside", "tyre", "head_lamp", "tail_lamp", "lamp_housing",
-    }  # fmt: skip
+        "paint",
+        "glass",
+        "trim",
+        "underside",
+        "tyre",
+        "head_lamp",
+        "tail_lamp",
+        "lamp_housing",
+    }

@@ -19,7 +19,8 @@ PERCENT = {"recall": "recall, %", "precision": "precision, %", "AP50": "AP50, %"
 COUNTS = {"boxes": "boxes per photograph", "wrong": "wrong boxes per photograph"}
 WORN = {"found": "found, %", "score": "mean score", "change": "change", "hidden": "hidden, %"}
 INTERVALS = (
-    "95 % intervals by the bootstrap over photographs, where there are at least five. Objects that a form ignores, and "
+    "95 % intervals by the bootstrap over photographs, where there are at least five; they take photographs as "
+    "independent, and are too narrow where several are of one drive or one moment. Objects that a form ignores, and "
     "those below the least height, count neither as found nor as missed."
 )
 

@@ -99,18 +99,18 @@ def soft_share(map: SunMap, view_index: int, p: wp.vec3, n: wp.vec3) -> float:
     limit = STEEPEST * map.texel
     slope_x = wp.clamp(axis[0] * steepness, -limit, limit)
     slope_y = wp.clamp(axis[1] * steepness, -limit, limit)
-    own = (1.0e3 - q[2] + map.texel) * 1.0e-3
+    own_depth = (1.0e3 - q[2] + map.texel) * 1.0e-3
     margin = (wp.abs(slope_x) + wp.abs(slope_y)) * float(search + 1) * 1.0e-3
     block = map.blocks[view_index, (row_index - search) / (2 * search), (column - search) / (2 * search)]
-    if block[0] <= own - margin:
+    if block[0] <= own_depth - margin:
         return 1.0
-    if block[1] > own + margin:
+    if block[1] > own_depth + margin:
         return 0.0
     # Every second texel of every second row is enough to measure the distance of the occluders.
     gap = float(0.0)
     count = int(0)
     for dy in range(-search, search + 1, 2):
-        across = own - (float(row_index + dy) - y) * slope_y * 1.0e-3
+        across = own_depth - (float(row_index + dy) - y) * slope_y * 1.0e-3
         for dx in range(-search, search + 1, 2):
             plane = across - (float(column + dx) - x) * slope_x * 1.0e-3
             depth = depth_of(map.keys, view_index, row_index + dy, column + dx)
@@ -128,7 +128,7 @@ def soft_share(map: SunMap, view_index: int, p: wp.vec3, n: wp.vec3) -> float:
     weight_sum = float(0.0)
     for dy in range(-reach, reach + 1):
         v = float(row_index + dy) - y
-        across = own - v * slope_y * 1.0e-3
+        across = own_depth - v * slope_y * 1.0e-3
         for dx in range(-reach, reach + 1):
             u = float(column + dx) - x
             weight = 1.0 - (u * u + v * v) * inverse
