@@ -219,8 +219,8 @@ def write_page() -> None:
         "",
         "How to read it: [test detectors on photographs](../how-to/test-on-photographs.md). Nothing in the suite "
         "`reality` was chosen on photographs, and no detector of SSAD is trained on them. Brackets: 95 % interval by "
-        "the bootstrap over photographs. It takes them as independent; where several are of one drive or one moment, it "
-        "is too narrow.",
+        "the bootstrap over photographs. It takes them as independent; where several are of one drive or one moment, "
+        "it is too narrow.",
     ]
     for name, entry in stored.items():
         data = entry["data"]
