@@ -26,7 +26,7 @@ class Effect:
 
     name: str
     summary: str
-    is_default: bool = False
+    is_default: bool = True
 
 
 EFFECTS: Final[dict[str, Effect]] = {
@@ -35,7 +35,7 @@ EFFECTS: Final[dict[str, Effect]] = {
         Effect("reflections", "Glass, paint and metal mirror the sky, the buildings and the trees around the camera."),
         Effect("wet-reflections", "Wet roads mirror what stands on them."),
         Effect("soft-shadows", "The penumbra of the sun grows with the distance of what casts the shadow."),
-        Effect("lit-signals", "Traffic lights show their state.", is_default=True),
+        Effect("lit-signals", "Traffic lights show their state."),
         Effect("walker-signals", "Signals for walkers stand at crossings whose traffic has signals."),
         Effect("vehicle-signals", "Stop lamps and indicators of vehicles shine."),
         Effect("street-lighting", "Streets at night have the light of a class of EN 13201."),
