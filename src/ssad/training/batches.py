@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, affine_grid, conv2d, grid_sample, pad
 
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
@@ -404,6 +404,65 @@ def augment_colours(images: Tensor, recipe: Recipe, rng: torch.Generator) -> Ten
     return images.clamp(0.0, 1.0)
 
 
+def blur_images(images: Tensor, max_deviation: float, rng: torch.Generator) -> Tensor:
+    """Return images, float [B, 3, H, W], of which half are blurred by a Gaussian of a random width.
+
+    Args:
+        images: In [0, 1].
+        max_deviation: Largest standard deviation, px.
+        rng: Random numbers, on the CPU.
+    """
+    is_blurred = torch.rand(len(images), generator=rng) < 0.5
+    deviation = (torch.rand(len(images), generator=rng) * max_deviation).clamp_min(1e-3)
+    radius = max(math.ceil(2.5 * max_deviation), 1)
+    offsets = torch.arange(-radius, radius + 1, dtype=images.dtype)
+    weights = torch.exp(-0.5 * (offsets / deviation[:, None]) ** 2)
+    weights = torch.where(is_blurred[:, None], weights, (offsets == 0).to(images.dtype))
+    weights = _send((weights / weights.sum(1, keepdim=True)).repeat_interleave(3, 0), images.device)
+    batch_size, _, height, width = images.shape
+    # A group for each channel of each image, as every image has a filter of its own.
+    channels = pad(images, (radius,) * 4, mode="replicate").reshape(
+        1, 3 * batch_size, *(2 * radius + length for length in (height, width))
+    )
+    blurred = conv2d(channels, weights[:, None, :, None], groups=3 * batch_size)
+    blurred = conv2d(blurred, weights[:, None, None, :], groups=3 * batch_size)
+    return blurred.reshape(images.shape)
+
+
+def natural_texture(shape: tuple[int, ...], generator: torch.Generator, device: torch.device) -> Tensor:
+    """Return random texture [..., H, W] with mean 0 and standard deviation 1 whose amplitude falls with 1 / frequency.
+
+    Source: Field, Relations between the statistics of natural images and the response properties of cortical cells
+    (JOSA A 4, 1987).
+    """
+    height, width = shape[-2:]
+    rows = torch.fft.fftfreq(height, device=device)[:, None]
+    columns = torch.fft.rfftfreq(width, device=device)[None, :]
+    frequency = (rows**2 + columns**2).sqrt()
+    frequency[0, 0] = math.inf
+    spectrum = torch.fft.rfft2(torch.randn(shape, generator=generator, device=device)) / frequency
+    texture = torch.fft.irfft2(spectrum, s=(height, width))
+    return texture / texture.std((-2, -1), keepdim=True).clamp_min(1e-9)
+
+
+def add_clutter(images: Tensor, max_contrast: float, rng: torch.Generator) -> Tensor:
+    """Return images, float [B, 3, H, W], with random texture of a random contrast over parts of them, in [0, 1].
+
+    Args:
+        images: In [0, 1].
+        max_contrast: Largest standard deviation of the texture.
+        rng: Random numbers, on the CPU.
+    """
+    device = images.device
+    batch_size, _, height, width = images.shape
+    contrast = _send(torch.rand((batch_size, 1, 1, 1), generator=rng) ** 2 * max_contrast, device)
+    generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=rng)))
+    textures = natural_texture((batch_size, 5, height, width), generator, device)
+    brightness, colour, region = textures[:, :1], textures[:, 1:4], textures[:, 4:]
+    share = torch.sigmoid(4.0 * region)
+    return (images + contrast * share * (brightness + 0.3 * colour)).clamp(0.0, 1.0)
+
+
 def make_batch(
     image_set: ImageSet, indices: Sequence[int], recipe: Recipe, *, key: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, list[Truth]]:
@@ -415,4 +474,12 @@ def make_batch(
     size = (images.shape[2], images.shape[3])
     changes = [draw_augmentation(recipe, size, random, lens=image_set.truth[index].intrinsic) for index in indices]
     truths = augment_truths([image_set.truth[index] for index in indices], changes, size, min_visible_share=recipe.keep)
-    return augment_colours(augment_images(images, changes), recipe, torch_random), move(truths, device)
+    images = augment_images(images, changes)
+    if recipe.clutter > 0:
+        images = add_clutter(images, recipe.clutter, torch_random)
+    if recipe.blur > 0:
+        images = blur_images(images, recipe.blur, torch_random)
+    if recipe.grey > 0:
+        has_colour = torch.rand((len(images), 1, 1, 1), generator=torch_random) >= recipe.grey
+        images = torch.where(_send(has_colour, device), images, images.mean(1, keepdim=True))
+    return augment_colours(images, recipe, torch_random), move(truths, device)

@@ -51,6 +51,11 @@ class Recipe:
         weigh: Factors of losses by name; 1 where there is none.
         jitter: Of brightness, contrast, saturation and gamma.
         noise: Largest standard deviation of added noise.
+        blur: Largest standard deviation of a Gaussian blur, px. Half of the images stay sharp.
+        grey: Probability of an image without colour.
+        clutter: Largest contrast of random texture that is laid over parts of an image. Its amplitude falls with the
+            inverse of the spatial frequency, as that of photographs does (Field 1987). Rendered surfaces are smoother
+            than real ones; a detector that has seen smooth ones alone takes texture for objects.
         keep: Least visible share of a box after a crop, 2D only (a 3D box stays while its middle is in sight).
         rare: Images with a class that fewer than this share of them show are repeated (`repetition_counts`); 0:
             none.
@@ -89,6 +94,9 @@ class Recipe:
     weigh: dict[str, Least] = field(default_factory=dict)
     jitter: Part = 0.3
     noise: Part = 0.02
+    blur: Least = 0.0
+    grey: Part = 0.0
+    clutter: Part = 0.0
     keep: Part = 0.0
     rare: Part = 0.0
     validate: Whole = 5
