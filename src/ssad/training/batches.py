@@ -441,7 +441,7 @@ def natural_texture(shape: tuple[int, ...], generator: torch.Generator, device: 
     frequency = (rows**2 + columns**2).sqrt()
     frequency[0, 0] = math.inf
     spectrum = torch.fft.rfft2(torch.randn(shape, generator=generator, device=device)) / frequency
-    texture = torch.fft.irfft2(spectrum, s=(height, width))
+    texture: Tensor = torch.fft.irfft2(spectrum, s=(height, width))
     return texture / texture.std((-2, -1), keepdim=True).clamp_min(1e-9)
 
 
