@@ -36,7 +36,6 @@ from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generat
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
-RECORDED_SENSOR = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +51,7 @@ class TexturableImage:
         radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
+        sensor: Sensor of the camera, with the effects of its lens.
     """
 
     file: str
@@ -62,6 +62,7 @@ class TexturableImage:
     radiance: F32
     exposure: float
     fragments: Any
+    sensor: SensorModel
 
     def prepare(
         self,
@@ -69,7 +70,6 @@ class TexturableImage:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
-        sensor: SensorModel = RECORDED_SENSOR,
         device: str | torch.device = "cpu",
     ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
@@ -78,7 +78,6 @@ class TexturableImage:
             sizes: Number of each texture -> its height and width, or one side, texels. It must cover all textures.
             masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
             quality: JPEG quality, as recorded; None: no compression.
-            sensor: Sensor of the camera.
             device: Device of the images.
 
         Raises:
@@ -99,7 +98,7 @@ class TexturableImage:
             for number, texture_size in sizes.items()
         }
         touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
-        window = ChangedWindow.around(touched_pixels, (1, height, width), sensor, quality=quality)
+        window = ChangedWindow.around(touched_pixels, (1, height, width), self.sensor, quality=quality)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
@@ -267,7 +266,7 @@ def texturable_images(
         StoreError: The folder cannot be written to.
     """
     cache_folder = _cache_folder(folder, layers, split)
-    rows = image_rows(folder, split)
+    rows, sensor = image_rows(folder, split), recorded_sensor(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
     missing_views = recorded_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
@@ -280,7 +279,17 @@ def texturable_images(
         image = read_image(folder / "images" / file)
         corner = int(cached["corner"][0]), int(cached["corner"][1])
         exposure = float(cached["exposure"])
-        yield TexturableImage(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
+        radiance, fragments = cached["radiance"], cached["fragments"]
+        yield TexturableImage(file, row, objects, image, corner, radiance, exposure, fragments, sensor)
+
+
+def recorded_sensor(folder: Path, split: str = "all") -> SensorModel:
+    """Return the sensor of a recording, with the effects of its lens.
+
+    Raises:
+        FormatError: The folder holds no recording of this version.
+    """
+    return with_lens_effects(SENSOR, recording_of(folder, split)["effects"])
 
 
 def uncached_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
@@ -351,7 +360,7 @@ def visible_part(picture: Rendering) -> dict[str, Any]:
 
 
 def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return visible_part(render(view.scene, [view.with_layers(*layers)]))
+    return visible_part(render(view.scene, [view.with_layers(*layers)], quality=view.quality))
 
 
 def _span(places: Any, limit: int) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from ssad.core.types import F64
 from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.photometry import per_lux
-from ssad.rendering.camera.render import View, render, scene_light
+from ssad.rendering.camera.render import RenderQuality, View, render, scene_light
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
 from ssad.rendering.camera.sensor import SensorModel
@@ -89,6 +89,7 @@ def render_lit_image(
     columns: slice,
     *,
     blind: int,
+    quality: RenderQuality = RenderQuality(),
     device: str | torch.device = "cpu",
 ) -> LitImage:
     """Render a view once, as a function of the light on a target.
@@ -100,9 +101,10 @@ def render_lit_image(
         rows: Rows of the crop around the target; its first row and column are even.
         columns: See `rows`.
         blind: Index of the body of `BLIND` in the scene.
+        quality: Quality of the rendering.
         device: Device of the images.
     """
-    rendering = render(scene, [view], surface=True)
+    rendering = render(scene, [view], quality=quality, surface=True)
     sensor = with_lens_effects(view.sensor, rendering.effects)
     if sensor.scatters:
         # The lens carries light from everywhere to everywhere.
@@ -114,7 +116,8 @@ def render_lit_image(
     # Two renderings, with and without the sun on the target, give the sun's share.
     shaded = rendering.radiance
     if sun[2] > 0.0:
-        shaded = render(scene, [SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))]).radiance
+        shaded_view = SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))
+        shaded = render(scene, [shaded_view], quality=quality).radiance
     irradiance = surface.irradiance[crop]
     surface_gain = np.where(irradiance > 0.0, surface.gain[crop] / np.maximum(irradiance, 1e-12), 0.0)
 
