@@ -607,7 +607,7 @@ class RecordedView:
     scene: RenderScene
     view: View
     objects: tuple[Mapping[str, Any], ...]
-    quality: RenderQuality = RenderQuality()
+    quality: RenderQuality
 
     def with_layers(self, *edits: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""

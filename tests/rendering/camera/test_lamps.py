@@ -197,7 +197,7 @@ def test_bodies_keep_the_sky_from_the_ground(scene: RenderScene) -> None:
 
 
 def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
-    """Radiance is gain times albedo where nothing mirrors and the air is clear; positions and normals are the ground's."""
+    """Radiance is gain times albedo where nothing mirrors or fades; positions lie on the ground; normals point up."""
     view = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)),), SceneWeather())
     picture = render(scene, [view], quality=RenderQuality(effects=ALL_EFFECTS - {"haze"}), surface=True)
     surface = picture.surface

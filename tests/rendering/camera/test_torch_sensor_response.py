@@ -9,8 +9,8 @@ import torch
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.glare import with_lens_effects
+from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
 from ssad.rendering.camera.sensor import DEFAULT_SENSOR
 from ssad.rendering.camera.texture import retexture, texture_taps, to_linear

@@ -65,8 +65,9 @@ class RelightableImage:
 
     def projected(self, edit: SceneEdit) -> TexturableImage:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
-        rendering = render(self.scene, [edit.on(self.view.view, TARGET)], quality=self.view.quality)
-        visible = visible_part(rendering)
+        view = edit.on(self.view.view, TARGET)
+        rendering = render(self.scene, [view], quality=self.view.quality)
+        visible = visible_part(rendering, view)
         corner = int(visible["corner"][0]), int(visible["corner"][1])
         image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
         return TexturableImage(
@@ -78,7 +79,8 @@ class RelightableImage:
             visible["radiance"],
             float(visible["exposure"]),
             visible["fragments"],
-            with_lens_effects(self.view.view.sensor, rendering.effects),
+            with_lens_effects(view.sensor, rendering.effects),
+            visible["noise"],
         )
 
     def lit(self, device: str | torch.device = "cpu") -> LitImage:

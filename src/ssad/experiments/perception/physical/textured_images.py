@@ -25,9 +25,8 @@ from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
 from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
-from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.glare import with_lens_effects
-from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.render import Rendering, View, render, view_noise
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
@@ -52,6 +51,7 @@ class TexturableImage:
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
         sensor: Sensor of the camera, with the effects of its lens.
+        noise: Noise of the photosites of the part in standard deviations [h, w]; None if there is none.
     """
 
     file: str
@@ -63,6 +63,7 @@ class TexturableImage:
     exposure: float
     fragments: Any
     sensor: SensorModel
+    noise: F32 | None = None
 
     def prepare(
         self,
@@ -102,7 +103,10 @@ class TexturableImage:
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
-        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image)
+        noise = None
+        if self.noise is not None:
+            noise = _cut(torch.tensor(self.noise), rectangle, window.read[0]).to(device)
+        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image, noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +119,7 @@ class PreparedImage:
         exposure: Factor on the radiance.
         taps: Contribution of each texture to the pixels of the image, by its number.
         before: The whole image as recorded, uint8 [3, H, W].
+        noise: Noise of the photosites of the part, as recorded [h, w]; None if there is none.
     """
 
     window: ChangedWindow
@@ -122,6 +127,7 @@ class PreparedImage:
     exposure: float
     taps: Mapping[int, Taps]
     before: Tensor
+    noise: Tensor | None = None
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
         """Return the image with textures on its target, [1, 3, H, W].
@@ -148,7 +154,7 @@ class PreparedImage:
         Args:
             pictures: Of one size, sensor and JPEG quality.
             textures: Number -> linear albedo in 0 to 1, one for each picture [B, 3, h, w].
-            noise: Of each picture, draws the sensor's noise where it changes; None for none there.
+            noise: Of each picture, draws new noise of the sensor where it changes; None for that of the recording.
 
         Returns:
             [B, 3, H, W] in [0, 1], differentiable in the textures.
@@ -195,18 +201,25 @@ class PreparedImage:
         noise: Sequence[torch.Generator] | None,
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
-        noise_sample = None
+        samples = [prepared.noise for prepared in pictures]
         if noise is not None:
+            # Noise is drawn for the image's own window, so that it does not depend on the batch.
             mosaic = window.sensor.mosaic
-            noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
+            shapes = [prepared.part.shape[: 2 if mosaic else 3] for prepared in pictures]
             generators = generators_on_device(noise, radiance.device)
-            for image_noise, prepared, read_rectangle, rng in zip(
-                noise_sample, pictures, window.read, generators, strict=True
+            samples = [
+                torch.randn(shape, generator=rng, device=rng.device)
+                for shape, rng in zip(shapes, generators, strict=True)
+            ]
+        noise_sample = None
+        if (first_sample := samples[0]) is not None:
+            noise_sample = radiance.new_zeros((*radiance.shape[:3], *first_sample.shape[2:]))
+            for image_noise, prepared, read_rectangle, sample in zip(
+                noise_sample, pictures, window.read, samples, strict=True
             ):
                 target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
-                # Noise is drawn for the image's own window, so that it does not depend on the batch.
-                window_shape = prepared.part.shape[:2] if mosaic else prepared.part.shape
-                image_noise[target_slices] = torch.randn(window_shape, generator=rng, device=rng.device)[source_slices]
+                if sample is not None:
+                    image_noise[target_slices] = sample[source_slices]
         exposure = torch.tensor([prepared.exposure for prepared in pictures]).to(radiance)
         recorded_images = torch.stack([prepared.before for prepared in pictures])
         return window.paste(window.develop(radiance, exposure, noise_sample), recorded_images)
@@ -279,8 +292,8 @@ def texturable_images(
         image = read_image(folder / "images" / file)
         corner = int(cached["corner"][0]), int(cached["corner"][1])
         exposure = float(cached["exposure"])
-        radiance, fragments = cached["radiance"], cached["fragments"]
-        yield TexturableImage(file, row, objects, image, corner, radiance, exposure, fragments, sensor)
+        radiance, fragments, noise = cached["radiance"], cached["fragments"], cached["noise"]
+        yield TexturableImage(file, row, objects, image, corner, radiance, exposure, fragments, sensor, noise)
 
 
 def recorded_sensor(folder: Path, split: str = "all") -> SensorModel:
@@ -341,14 +354,16 @@ def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], s
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def visible_part(picture: Rendering) -> dict[str, Any]:
-    """What is kept of one rendered picture: the part around what shows textures."""
+def visible_part(picture: Rendering, view: View) -> dict[str, Any]:
+    """What is kept of one rendered picture of a view: the part around what shows textures."""
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
     (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
     if with_lens_effects(SENSOR, picture.effects).scatters:
         # The lens carries light from everywhere to everywhere.
         (top, bottom), (left, right) = (0, height), (0, width)
+    noise = view_noise(view)
+    assert noise is not None
     fragments = picture.fragments.copy()
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
@@ -356,11 +371,13 @@ def visible_part(picture: Rendering) -> dict[str, Any]:
         "radiance": picture.radiance[0, top:bottom, left:right],
         "exposure": picture.exposure[0],
         "fragments": fragments,
+        "noise": noise[top:bottom, left:right],
     }
 
 
 def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return visible_part(render(view.scene, [view.with_layers(*layers)], quality=view.quality))
+    dressed_view = view.with_layers(*layers)
+    return visible_part(render(view.scene, [dressed_view], quality=view.quality), dressed_view)
 
 
 def _span(places: Any, limit: int) -> tuple[int, int]:
