@@ -471,8 +471,8 @@ def page() -> str:
         "`python benchmarks/detector_accuracy.py --clips e_drive e_orbit e_sign --drives val3d2`, then the same with "
         "`--page`.",
         "",
-        "`benchmarks/detector_accuracy.py` measures it and makes this page. All images show towns that were not used for",
-        "training (Oldmarket and Larkhill):",
+        "`benchmarks/detector_accuracy.py` measures it and makes this page. All images show towns that were not used",
+        "for training (Oldmarket and Larkhill):",
         "```",
         *data["clips"],
         *data["drives"],
