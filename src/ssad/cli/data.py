@@ -202,7 +202,7 @@ def record(
         str,
         typer.Option(
             metavar="default|all|none|NAME,...",
-            help="Effects of the rendering. lit-signals is what was on before the others were.",
+            help="Effects of the rendering. Only lit-signals was on in earlier versions.",
         ),
     ] = "default",
     device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
