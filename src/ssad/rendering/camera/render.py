@@ -403,8 +403,7 @@ def render(
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
     material = None
-    glows = has_glow(views, lights)
-    if materials or glows or finishes is not None:
+    if materials or finishes is not None:
         found_materials = wp.empty(shape, dtype=int, device=device)
         inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
@@ -413,8 +412,8 @@ def render(
         surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
         inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
         wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
-    if glows:
-        add_glow(output.radiance, found_materials, scene, views, lights)
+    if has_glow(views, lights):
+        add_glow(output.radiance, visible, scene, views, lights)
     add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
