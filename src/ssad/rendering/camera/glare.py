@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import warp as wp
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.types import F64
 from ssad.rendering.camera.kernels import glare as kernels
 from ssad.rendering.camera.kernels import lamp_glow, sky
 from ssad.rendering.camera.lamps import NIGHT_LUX, struct_array
-from ssad.rendering.camera.sensor import LUMINANCE, SMALLEST, SensorModel
+from ssad.rendering.camera.sensor import SMALLEST, SensorModel
 
 if TYPE_CHECKING:
     from ssad.rendering.camera.render import View
