@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -22,6 +23,7 @@ MAX_TUFTS = 4000  # of a town
 LIMITS = (10, 140)  # km/h, speed limits that signs show
 LIMIT_STATIONS = (12.0, 40.0, 2.0)  # m from the start of a road to its speed-limit sign: first, end, step
 LIMIT_END = 18.0  # m before the end of a road that stay without speed-limit sign
+REPEAT = 120.0  # m from one speed-limit sign of a road to the next
 SIGHT = 6.0  # m before a speed-limit sign on which nothing stands
 
 
@@ -119,7 +121,7 @@ def _clear_position(ground: FreeGround, xy: tuple[float, float], yaw: float) -> 
 def place_limit_signs(
     graph: LaneGraph, ground: FreeGround, street_sides: list[Side]
 ) -> list[tuple[float, float, float, float, float]]:
-    """Take the ground of speed-limit signs: after junctions, and where the limit of a road changes.
+    """Take the ground of speed-limit signs: after junctions, where a limit changes, and again each `REPEAT` m.
 
     The signs are bodies of their own. They stand at the right-hand edge, with a clear view over `SIGHT` m.
 
@@ -136,17 +138,20 @@ def place_limit_signs(
             continue
         limit = _sign_limit(graph, lane)
         before = graph.predecessors(lane).tolist()
-        is_announced = any(graph.junction[other] >= 0 or _sign_limit(graph, other) != limit for other in before)
-        last_station = side.length - LIMIT_END
-        if not is_announced or not LIMITS[0] <= limit <= LIMITS[1]:
+        if not LIMITS[0] <= limit <= LIMITS[1]:
             continue
-        for station, outward in ((s, o) for s in np.arange(*LIMIT_STATIONS).tolist() for o in (0.1, 0.3, 0.5, 0.7)):
-            x, y, yaw = side.pose(station, _kerb_offset(side) + outward)
-            view = [(x - along * np.cos(yaw), y - along * np.sin(yaw)) for along in np.arange(0.0, SIGHT, CELL)]
-            if station <= last_station and ground.is_clear((x, y), size=0.1) and not ground.is_occupied(view):
-                signs.append((x, y, yaw, KERB if side.kerb else 0.0, float(limit)))
-                ground.occupy(view)
-                break
+        is_announced = any(graph.junction[other] >= 0 or _sign_limit(graph, other) != limit for other in before)
+        starts = [*([0.0] if is_announced else []), *np.arange(REPEAT, side.length, REPEAT).tolist()]
+        for start in starts:
+            for station, outward in product(np.arange(*LIMIT_STATIONS).tolist(), (0.1, 0.3, 0.5, 0.7)):
+                if start + station > side.length - LIMIT_END:
+                    continue
+                x, y, yaw = side.pose(start + station, _kerb_offset(side) + outward)
+                view = [(x - along * np.cos(yaw), y - along * np.sin(yaw)) for along in np.arange(0.0, SIGHT, CELL)]
+                if ground.is_clear((x, y), size=0.1) and not ground.is_occupied(view):
+                    signs.append((x, y, yaw, KERB if side.kerb else 0.0, float(limit)))
+                    ground.occupy(view)
+                    break
     return signs
 
 
