@@ -191,6 +191,11 @@ BODIES: dict[str, BodyKind] = {
             "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
         },
     ),
+    "limit_sign": BodyKind(
+        furniture.limit_sign,
+        # 600 mm in towns, 750 mm on faster roads
+        {str(limit): BodyStyle((0.08, 0.60 if limit < 70 else 0.75, 2.80), 0.02) for limit in range(10, 150, 10)},
+    ),
     "debris": BodyKind(
         anomalies.debris,
         {

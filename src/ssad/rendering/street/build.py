@@ -16,6 +16,7 @@ from ssad.rendering.street.bays import lay_bays
 from ssad.rendering.street.dressing import (
     Masts,
     place_furniture,
+    place_limit_signs,
     place_signal_masts,
     place_street_lamps,
     plant_grass,
@@ -32,7 +33,7 @@ from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tile
 from ssad.rendering.street.yards import lay_yards
 from ssad.world.roads.library import load_town
 
-REVISION = 5  # of the construction: a cached street of another revision is not used
+REVISION = 7  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
@@ -62,6 +63,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     paint_markings(builder, graph, materials)
     place_signal_masts(builder, graph, free_ground, materials, masts)
     place_street_lamps(builder, free_ground, materials, street_sides, masts)
+    limit_signs = place_limit_signs(graph, free_ground, street_sides)
     yards = lay_yards(builder, free_ground, materials, street_sides)
     plots = build_along_streets(builder, free_ground, materials, street_sides)
     fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
@@ -93,6 +95,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
         parking=_f32(plots.parking + yards.cells, 3),
         bays=_f32(bays, 5),
         yards=_f32(yards.rows, 5),
+        limit_signs=_f32(limit_signs, 5),
     )
 
 
@@ -128,6 +131,8 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
         "sign_kind",
         "rule_sign",
         "rule_lane",
+        "speed_limit",
+        "left_hand",
     ):
         digest.update(getattr(graph, key).tobytes())
     path = home_folder() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
