@@ -221,7 +221,7 @@ def test_bays_lie_between_the_lanes_and_a_walkway() -> None:
 
 def test_foliage_is_small_and_no_street_is_one_green_to_the_horizon() -> None:
     scene = street("Twinford")
-    leaf = of(scene, ("leaves_round", "leaves_tall", "leaves_birch"))
+    leaf = of(scene, ("twigs",))
     near = leaf & np.isin(np.arange(len(scene.faces)), scene.order[scene.offset[0, 0] : scene.offset[0, -1]])
     p = corners(scene)[near]
     longest = np.linalg.norm(p - np.roll(p, 1, axis=1), axis=-1).max(axis=1)
