@@ -61,6 +61,19 @@ def visible(
     return np.where(keys > 0, slot // 2, -1), np.where(keys > 0, near, 0)
 
 
+def test_a_scene_has_leaves_of_one_size_on_cards_of_twigs_and_no_others() -> None:
+    card = np.array([[-0.65, 0.0, 0.0], [0.0, 0.0, 2.6], [0.65, 0.0, 0.0]])
+    bodies = [
+        build(size * card, [[0, 1, 2]], materials=[replace(GREY, name=name)], material=[0])
+        for size, name in ((1.0, "twigs"), (0.5, "twigs"), (1.0, "grey"))
+    ]
+    large, small, solid = RenderScene(None, bodies).twigs.numpy().tolist()
+    assert (large % 64, large // 64 % 64) == (20, 10)
+    assert (small % 64, small // 64 % 64) == (10, 5)
+    assert large // 4096 != small // 4096
+    assert solid == 0
+
+
 def test_leaves_are_cut_out_of_a_card_and_keep_its_depth_and_form_in_perspective() -> None:
     face = np.array([[0, 1, 2]])
     card = np.array([[-0.4, 0.5, 1.0], [0.0, -0.5, 1.4], [0.4, 0.5, 1.0]], np.float32)[::-1].copy()

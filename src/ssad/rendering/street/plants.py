@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.geometry import cross
+from ssad.core.seeding import generator
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.model import FAR, MID, NEAR
 from ssad.rendering.street.palette import TownMaterials
@@ -69,10 +70,10 @@ BALL, BALL_FACES = _icosahedron()
 
 
 def blob(
-    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14, details: bool = False
+    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14, key: str = ""
 ) -> TrianglePiece:
-    """An uneven ellipsoid of 20 triangles, shaded smooth; `details`: drawn as decoration that moves no house."""
-    rng = materials.details if details else materials.generator
+    """An uneven ellipsoid of 20 triangles, shaded smooth; with a `key`, its form takes no draw from the town's generator."""
+    rng = generator(key, *centre.tolist(), *radius.tolist()) if key else materials.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
     directions = BALL @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -89,8 +90,12 @@ def leaves(
     size: float,
     materials: list[int],
     levels: int = NEAR,
+    sparse: bool = False,
 ) -> TrianglePiece:
-    """Leaf cards about `size` m long in the outer half of an ellipsoid, tilted at random, outsides away from it."""
+    """Leaf cards about `size` m long in the outer half of an ellipsoid, tilted at random, outsides away from it.
+
+    `sparse` leaves out every third card, but not its draws: they decide about parking bays, too.
+    """
     rng = style_materials.details
     positions = np.arange(count) + 0.5
     z = 1.0 - 1.9 * positions / count  # few leaves at the underside
@@ -112,7 +117,9 @@ def leaves(
     shade = 0.35 * (1.0 - z) + 1.5 * (0.97 - depth)
     material_index = np.clip((shade * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1)
     twigs = _twigs(materials, style_materials)[material_index]
-    return _leaf_cards(centres, leaf_normals, side_axes, half_sizes, vertex_normals, twigs, levels=levels)
+    drawn = np.flatnonzero(positions % 3 < 2) if sparse else np.arange(count)
+    card_arrays = (values[drawn] for values in (centres, leaf_normals, side_axes, half_sizes, vertex_normals, twigs))
+    return _leaf_cards(*card_arrays, levels=levels)
 
 
 def _twigs(greens: list[int], materials: TownMaterials) -> npt.NDArray[np.int64]:
@@ -164,7 +171,7 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
         blob(centre, 0.98 * radius, greens[1], materials, levels=FAR, rough=0.1),
     ]
     lobe_count = {"round": 3, "tall": 2, "birch": 3}[kind]
-    leaf_count = {"round": 64, "tall": 68, "birch": 54}[kind]
+    leaf_count = {"round": 88, "tall": 94, "birch": 76}[kind]
     for lobe_index in range(lobe_count):
         angle = 2.0 * np.pi * lobe_index / lobe_count + rng.uniform(-0.5, 0.5)
         height_offset = (lobe_index / max(lobe_count - 1, 1) - 0.5) * 0.7
@@ -181,6 +188,7 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
                 count=leaf_count,
                 size=0.66 * float(lobe_radius.mean()),
                 materials=[materials.palette.shade(greens[0], 1.35), *greens],
+                sparse=True,
             ),
             leaves(
                 centre + lobe_offset,
@@ -190,6 +198,7 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
                 size=0.62 * float(lobe_radius.mean()),
                 materials=greens,
                 levels=MID,
+                sparse=True,
             ),
         ]
     return join(parts)
@@ -199,8 +208,8 @@ def _shells(centre: F64, radius: F64, greens: list[int], materials: TownMaterial
     """Two shells of leaves around the dark inside of a crown, the outer one lighter."""
     dark, light = _twigs([greens[-1], greens[1]], materials).tolist()
     return [
-        blob(centre, 0.97 * radius, dark, materials, levels=VISIBLE, rough=0.16, details=True),
-        blob(centre, 1.05 * radius, light, materials, levels=NEAR, rough=0.2, details=True),
+        blob(centre, 0.97 * radius, dark, materials, levels=VISIBLE, rough=0.16, key="inner leaves"),
+        blob(centre, 1.05 * radius, light, materials, levels=NEAR, rough=0.2, key="outer leaves"),
     ]
 
 
