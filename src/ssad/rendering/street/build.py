@@ -33,7 +33,7 @@ from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tile
 from ssad.rendering.street.yards import entrances, lay_yards
 from ssad.world.roads.library import load_town
 
-REVISION = 7  # of the construction: a cached street of another revision is not used
+REVISION = 10  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
