@@ -29,14 +29,25 @@ from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.render import Rendering, render
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
-from ssad.rendering.camera.sensor import SENSOR, SensorModel
+from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
-from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generators_on_device
+from ssad.rendering.camera.torch_sensor import (
+    PART_LEVELS,
+    ChangedWindow,
+    Rectangle,
+    curve,
+    generators_on_device,
+    scatter,
+    scatter_parts,
+)
 
+VISIBLE = 1.0 / 255.0  # change of a value from which on the glow of a texture counts
 KEPT = ".seen"  # folder of a recording for what has been rendered
-MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
+MARGIN = 80  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
-RECORDED_SENSOR = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
+STEP = 2**PART_LEVELS  # px at whose multiples windows begin, so that glare does not depend on them
+LENS = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
+"""Sensor of the recordings, with the light that its lens scatters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +60,12 @@ class TexturableImage:
         objects: What is annotated in it (see `RecordedView`).
         image: As recorded, uint8 RGB [H, W, 3].
         corner: Row and column at which `radiance` begins in it.
-        radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
+        radiance: Behind the lens, of the part around what wears the textures, linear, textured pixels without them
+            [h, w, 3].
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
+        glow: Rows and columns of the picture in which light from the textures, scattered by the lens, can change a code
+            by more than one.
     """
 
     file: str
@@ -62,6 +76,7 @@ class TexturableImage:
     radiance: F32
     exposure: float
     fragments: Any
+    glow: Rectangle
 
     def prepare(
         self,
@@ -69,7 +84,7 @@ class TexturableImage:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
-        sensor: SensorModel = RECORDED_SENSOR,
+        glow: bool = True,
         device: str | torch.device = "cpu",
     ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
@@ -78,7 +93,8 @@ class TexturableImage:
             sizes: Number of each texture -> its height and width, or one side, texels. It must cover all textures.
             masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
             quality: JPEG quality, as recorded; None: no compression.
-            sensor: Sensor of the camera.
+            glow: Whether the light that the lens scatters of the textures reaches as far as it can be seen, at night
+                over the whole picture; False: no farther than a few pixels, which takes less time and memory.
             device: Device of the images.
 
         Raises:
@@ -99,7 +115,11 @@ class TexturableImage:
             for number, texture_size in sizes.items()
         }
         touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
-        window = ChangedWindow.around(touched_pixels, (1, height, width), sensor, quality=quality)
+        if glow and len(touched_pixels):
+            (first_row, last_row), (first_column, last_column) = self.glow
+            corners = [first_row * width + first_column, (last_row - 1) * width + last_column - 1]
+            touched_pixels = torch.cat([touched_pixels, torch.tensor(corners)])
+        window = ChangedWindow.around(touched_pixels, (1, height, width), SENSOR, quality=quality, step=STEP)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
@@ -112,7 +132,7 @@ class PreparedImage:
 
     Attributes:
         window: Part of the image that is developed anew.
-        part: Radiance that the window reads, without the textures [h, w, 3].
+        part: Radiance behind the lens that the window reads, without the textures [h, w, 3].
         exposure: Factor on the radiance.
         taps: Contribution of each texture to the pixels of the image, by its number.
         before: The whole image as recorded, uint8 [3, H, W].
@@ -162,7 +182,7 @@ class PreparedImage:
 
     @staticmethod
     def lit(pictures: Sequence[PreparedImage], textures: Mapping[int, Tensor]) -> tuple[Tensor, ChangedWindow]:
-        """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
+        """The first half of `together`: radiance [B, h, w, 3] behind the lens that a window of all pictures reads."""
         first_window, batch_size = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
         if missing:
@@ -175,18 +195,20 @@ class PreparedImage:
                 first_window.sensor,
                 quality=first_window.quality,
                 subsampling=first_window.subsampling,
+                step=STEP,
             )
-        (rows, columns), (_, _, image_width) = window.read[0], first_window.shape
+        (rows, columns), (_, image_height, image_width) = window.read[0], first_window.shape
         window_size = rows[1] - rows[0], columns[1] - columns[0]
         radiance = pictures[0].part.new_zeros((batch_size, *window_size, 3))
+        texture_light = torch.zeros_like(radiance)
         for window_radiance, prepared, read_rectangle in zip(radiance, pictures, window.read, strict=True):
             target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
             window_radiance[target_slices] = prepared.part[source_slices]
         corners = [(read_rectangle[0][0], read_rectangle[1][0]) for read_rectangle in window.read]
         for layer in pictures[0].taps:
             taps = combine_taps([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
-            radiance = retexture(taps, textures[layer], radiance)
-        return radiance, window
+            texture_light = retexture(taps, textures[layer], texture_light)
+        return radiance + scatter_parts(texture_light, LENS, corners, (image_height, image_width)), window
 
     @staticmethod
     def developed(
@@ -275,12 +297,10 @@ def texturable_images(
         if file in missing_files:
             safeio.make_folder(cache_folder)
             # The views come in the order of the rows, so the next one belongs to this row.
-            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers))
+            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers, device))
         cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
-        corner = int(cached["corner"][0]), int(cached["corner"][1])
-        exposure = float(cached["exposure"])
-        yield TexturableImage(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
+        yield TexturableImage(file, row, objects, image, **parse_part(cached))
 
 
 def uncached_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
@@ -322,7 +342,7 @@ def cache_texture_images(
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():
-                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers))
+                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers, device))
 
 
 def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
@@ -332,34 +352,61 @@ def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], s
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def visible_part(picture: Rendering) -> dict[str, Any]:
-    """What is kept of one rendered picture: the part around what shows textures."""
+def visible_part(picture: Rendering, device: str = "cpu") -> dict[str, Any]:
+    """Return arrays of the part of a rendering around what shows textures, see `parse_part`.
+
+    It is behind the lens, which scatters the light of the whole picture.
+    """
     height, width = picture.radiance.shape[1:3]
-    rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
-    (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
-    if with_lens_effects(SENSOR, picture.effects).scatters:
-        # The lens carries light from everywhere to everywhere.
-        (top, bottom), (left, right) = (0, height), (0, width)
     fragments = picture.fragments.copy()
+    light = torch.from_numpy(picture.radiance[:1]).to(device)
+    lens = with_lens_effects(SENSOR, picture.effects)
+    background = scatter(light, lens)
+    places = torch.from_numpy(fragments["place"].astype(np.int64)).to(device)
+    white = torch.from_numpy(np.ascontiguousarray(fragments["light"], np.float32)).to(device)
+    texture_light = torch.zeros_like(light).reshape(-1, 3).index_add(0, places, white).reshape(light.shape)
+    exposure = float(picture.exposure[0])
+    # A white texture gives most light, and a dark background shows it best.
+    change = curve((background + scatter(texture_light, lens)) * exposure) - curve(background * exposure)
+    is_changed = (change[0].amax(-1) > VISIBLE).reshape(-1).index_fill(0, places, True)
+    rows, columns = np.divmod(torch.nonzero(is_changed)[:, 0].cpu().numpy(), width)
+    glow = tuple((int(axis.min()), int(axis.max()) + 1) if len(axis) else (0, 0) for axis in (rows, columns))
+    (top, bottom), (left, right) = (_span(*pair) for pair in zip(glow, (height, width), strict=True))
+    rows, columns = np.divmod(fragments["place"].astype(np.int64), width)
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
         "corner": np.array([top, left]),
-        "radiance": picture.radiance[0, top:bottom, left:right],
+        "radiance": background[0, top:bottom, left:right].cpu().numpy(),
         "exposure": picture.exposure[0],
         "fragments": fragments,
+        "glow": np.array(glow),
     }
 
 
-def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return visible_part(render(view.scene, [view.with_layers(*layers)]))
+def parse_part(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a `TexturableImage` from the arrays of `visible_part`."""
+    rows, columns = arrays["glow"].tolist()
+    return {
+        "corner": (int(arrays["corner"][0]), int(arrays["corner"][1])),
+        "radiance": arrays["radiance"],
+        "exposure": float(arrays["exposure"]),
+        "fragments": arrays["fragments"],
+        "glow": (tuple(rows), tuple(columns)),
+    }
 
 
-def _span(places: Any, limit: int) -> tuple[int, int]:
-    """Where a part begins and ends that holds all places and their margin; a block if there are none."""
-    if not len(places):
+def _render_visible_part(
+    view: RecordedView, layers: Sequence[TextureLayer | TextureDecal], device: str
+) -> dict[str, Any]:
+    return visible_part(render(view.scene, [view.with_layers(*layers)]), device)
+
+
+def _span(span: tuple[int, int], limit: int) -> tuple[int, int]:
+    """Where a part begins and ends that holds a span and its margin; a block if it is empty."""
+    if span[0] == span[1]:
         return 0, min(BLOCK, limit)
-    start = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
-    return start, min(int(places.max()) + MARGIN + 1, limit)
+    start = max(span[0] - MARGIN, 0) // BLOCK * BLOCK
+    return start, min(span[1] + MARGIN, limit)
 
 
 def _layer_key(layer: TextureLayer | TextureDecal) -> tuple[object, ...]:
