@@ -1,10 +1,12 @@
 """How well the shipped detectors see, by class, size, distance and light, in towns that they never saw.
 
     python benchmarks/detector_accuracy.py [--clips CLIPS ...] [--drives DRIVES] [--device cuda] [--out FILE]
+        [--weights FOLDER]
     python benchmarks/detector_accuracy.py --page      # docs/results/accuracy.md from benchmarks/results/accuracy.json
 
 CLIPS: folders that `ssad record --clips` wrote; DRIVES: a folder that `ssad record` wrote. Only pictures of held-out
-towns count (splits test and val). What is not named stays as it was measured before.
+towns count (splits test and val). What is not named stays as it was measured before. FOLDER: weights named as the
+shipped ones, which are measured in their place.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import subprocess
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,6 +27,7 @@ import numpy as np
 import torch
 
 from ssad.core import safeio
+from ssad.core.checkpoints import state_hash
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ALIKE, CLASSES
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
@@ -54,6 +58,13 @@ SMALL = 24.0  # px
 FAINT = 4.0  # contrast-to-noise ratio below which a thing hardly stands out
 WIDTHS = (960, 1280)  # px to which pictures of 640 px are enlarged inside 2D detectors
 SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detector says
+
+
+def commit() -> str:
+    """Return the commit of this version and its date; without the repository: unknown."""
+    words = ["git", "-C", str(ROOT), "log", "-1", "--format=%h (%cs)", "--abbrev=7"]
+    finished = subprocess.run(words, capture_output=True, text=True, check=False)
+    return finished.stdout.strip() or "unknown"
 
 
 def weather_of(description: str) -> str:
@@ -141,9 +152,16 @@ class TargetRecording:
         return Boxes2D(self.image, self.label, self.box, ignore=self.crowd | ~counts)
 
 
-def found_in(name: str, clips: TargetRecording, device: str, **options: Any) -> Boxes2D:
+def load_detector(name: str, device: str, folder: Path | None, **options: Any) -> Any:
+    """Return a detector with the weights of a folder, or with the shipped ones."""
+    return make_detector(
+        name, weights=None if folder is None else folder / f"{name}.safetensors", device=device, **options
+    )
+
+
+def found_in(name: str, clips: TargetRecording, device: str, folder: Path | None, **options: Any) -> Boxes2D:
     """All detections of a detector with these options, with the labels of the clips."""
-    detector = make_detector(name, device=device, **options)
+    detector = load_detector(name, device, folder, **options)
     starts = range(0, len(clips.files), 16)
     batches = (np.stack([read_image(file) for file in clips.files[start : start + 16]]) for start in starts)
     found = detect_2d(detector, map(torch.from_numpy, batches), device=device)
@@ -218,9 +236,9 @@ def by_contrast(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str
     }
 
 
-def flat_tables(name: str, clips: TargetRecording, device: str) -> dict[str, Any]:
+def flat_tables(name: str, clips: TargetRecording, device: str, folder: Path | None) -> dict[str, Any]:
     """One 2D detector: AP50 by class and light, recall by size and distance."""
-    found, labels = found_in(name, clips, device), len(clips.classes)
+    found, labels = found_in(name, clips, device, folder), len(clips.classes)
     every = ~clips.crowd
     ap = average_precision(clips.truth(every), found, labels=labels)
     car = clips.classes.index("car")
@@ -255,7 +273,8 @@ def flat_tables(name: str, clips: TargetRecording, device: str) -> dict[str, Any
         kind: recall(clips, found, clips.small(kind), labels) for kind in ("car", "pedestrian")
     }
     result["small cars"] = small_cars(clips, found, labels)
-    for width, own in ((None, found), *((w, found_in(name, clips, device, input_width=w)) for w in WIDTHS)):
+    enlarged = ((width, found_in(name, clips, device, folder, input_width=width)) for width in WIDTHS)
+    for width, own in ((None, found), *enlarged):
         values = average_precision(clips.truth(every), own, labels=labels)
         result.setdefault("enlarged", {})[str(width or "as they are")] = {
             "mean": float(np.nanmean(values)),
@@ -272,9 +291,9 @@ def between(boxes: BoxTable, low: float, high: float) -> BoxTable:
     return boxes.take(np.flatnonzero((boxes.ego_distance >= low) & (boxes.ego_distance < high)))
 
 
-def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
+def solid_tables(name: str, root: Path, device: str, folder: Path | None) -> dict[str, Any]:
     """One 3D detector: scores by class, light and distance, errors by class, duplicates."""
-    detector = make_detector(name, device=device)
+    detector = load_detector(name, device, folder)
     with NuScenes(root) as data:
         version, scenes = data.version, scenes_of(data, "val")
         light = {scene.name: weather_of(scene.description) for scene in data.scenes() if scene.name in scenes}
@@ -444,14 +463,16 @@ def page() -> str:
     """docs/results/accuracy.md, from what was measured."""
     data = json.loads(RESULT.read_text())
     flat, solid = data["flat"], data["solid"]
+    weights = ", ".join(f"`{name}` {digits}" for name, digits in sorted(data["weights"].items()))
     lines = [
         "# Accuracy of the shipped detectors",
         "",
-        "> **Stored result.** Commit: f0dc6d2 (2026-11-26). Weights: not recorded. Torch: not recorded. Make "
-        "it anew: `python benchmarks/detector_accuracy.py`, then the same with `--page`.",
+        f"> **Stored result.** Commit: {data['commit']}. Weights: {weights}. Torch: {data['torch']}. Make it anew: "
+        "`python benchmarks/detector_accuracy.py --clips e_drive e_orbit e_sign --drives val3d2`, then the same with "
+        "`--page`.",
         "",
-        "`benchmarks/detector_accuracy.py` measures it and makes this page. The stored file names neither commit nor",
-        "versions nor weights. All images show towns that were not used for training (Oldmarket and Larkhill):",
+        "`benchmarks/detector_accuracy.py` measures it and makes this page. All images show towns that were not used",
+        "for training (Oldmarket and Larkhill):",
         "```",
         *data["clips"],
         *data["drives"],
@@ -591,19 +612,33 @@ def main() -> None:
     parser.add_argument("--drives", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--weights", type=Path, help="folder of weights to measure in place of the shipped ones")
     parser.add_argument("--page", action="store_true", help="write docs/results/accuracy.md from what was measured")
     given = parser.parse_args()
     if given.page:
         PAGE.write_text(page())
         return
     result = json.loads(given.out.read_text()) if given.out.is_file() else {}
+    folder = given.weights
+
+    def measured_names(names: Sequence[str]) -> list[str]:
+        return [name for name in names if folder is None or (folder / f"{name}.json").is_file()]
+
+    measured: list[str] = []
     if given.clips:
         clips = TargetRecording(given.clips)
-        result["clips"] = [describe_data(folder) for folder in given.clips]
-        result["flat"] = {name: flat_tables(name, clips, given.device) for name in FLAT}
+        result["clips"] = [describe_data(clip_folder) for clip_folder in given.clips]
+        result["flat"] = {name: flat_tables(name, clips, given.device, folder) for name in measured_names(FLAT)}
+        measured += measured_names(FLAT)
     if given.drives is not None:
         result["drives"] = [describe_data(given.drives)]
-        result["solid"] = {name: solid_tables(name, given.drives, given.device) for name in SOLID}
+        result["solid"] = {
+            name: solid_tables(name, given.drives, given.device, folder) for name in measured_names(SOLID)
+        }
+        measured += measured_names(SOLID)
+    hashes = {name: state_hash(load_detector(name, "cpu", folder))[:12] for name in measured}
+    result["weights"] = result.get("weights", {}) | hashes
+    result |= {"commit": commit(), "torch": torch.__version__.partition("+")[0]}
     given.out.write_text(json.dumps(result, indent=1, default=float) + "\n")
 
 
