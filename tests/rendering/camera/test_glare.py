@@ -12,13 +12,15 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.rendering.camera import glare
-from ssad.rendering.camera.render import SceneWeather, View, develop_radiance, render, scene_light
+from ssad.rendering.camera.effects import NO_EFFECTS
+from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, develop_radiance, render, scene_light
 from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.sensor import DEFAULT_SENSOR, PINHOLE, SensorModel
 from ssad.rendering.camera.torch_sensor import ChangedWindow, develop, photosites, scatter, scatter_parts
 from ssad.rendering.meshes.mesh import Material, build
 
 HAZY = SensorModel(glare=1.0)
+CLEAR = RenderQuality(effects=NO_EFFECTS)
 HAZY_PINHOLE = replace(PINHOLE, glare=0.5)
 FLARING = SensorModel(glare=0.5, flare=40.0)
 SIZES = ((40, 56), (45, 37), (5, 4))
@@ -160,7 +162,7 @@ def test_the_disc_of_the_sun_sends_all_its_light_unless_something_hides_it() -> 
     camera = Camera.typical(96, 64)
     views = [View(camera, FORWARD, (), weather, sensor) for sensor in (PINHOLE, replace(PINHOLE, glare=0.1))]
     views.append(replace(views[1], objects=(SceneObject(0, np.eye(4), tag=1),)))
-    plain, glaring, hidden = render(stage, views).radiance.astype(float)
+    plain, glaring, hidden = render(stage, views, quality=CLEAR).radiance.astype(float)
     irradiance = np.pi * np.array(scene_light(weather)[0][1])
     focal = camera.intrinsic[0, 0] * camera.intrinsic[1, 1]
     assert (glaring - plain).sum((0, 1)) / focal == pytest.approx(irradiance, rel=0.25)
@@ -192,7 +194,7 @@ def test_lit_lamps_glow_at_night_with_the_light_of_their_luminance() -> None:
             for mesh in (0, 1)
             for sensor in (PINHOLE, HAZY_PINHOLE)
         ]
-        plain, hazy, unlit, hazy_unlit = render(stage, views).radiance.astype(float)
+        plain, hazy, unlit, hazy_unlit = render(stage, views, quality=CLEAR).radiance.astype(float)
         assert (hazy_unlit == unlit).all()
         if not glows:
             assert (hazy == plain).all()

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.effects import NO_EFFECTS, select_effects
+from ssad.rendering.camera.effects import ALL_EFFECTS, NO_EFFECTS, select_effects
 from ssad.rendering.camera.lamps import (
     BRAKE_RATIO,
     NIGHT_LUX,
@@ -197,9 +197,9 @@ def test_bodies_keep_the_sky_from_the_ground(scene: RenderScene) -> None:
 
 
 def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
-    """Radiance is gain times albedo where nothing mirrors; positions lie on the ground; normals point up."""
+    """Radiance is gain times albedo where nothing mirrors or fades; positions lie on the ground; normals point up."""
     view = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)),), SceneWeather())
-    picture = render(scene, [view], surface=True)
+    picture = render(scene, [view], quality=RenderQuality(effects=ALL_EFFECTS - {"haze"}), surface=True)
     surface = picture.surface
     assert surface is not None
     solid = picture.tag[0] == 0
@@ -350,7 +350,7 @@ def test_stop_lamps_and_indicators_shine(scene: RenderScene, weather: SceneWeath
     assert right[:, 64:].sum() == pytest.approx(left[:, :64].sum(), rel=0.2)
     assert not right[:, :64].any()
     assert 0.15 < left[..., 1].sum() / left[..., 0].sum() < 0.5, "amber"
-    assert not gained(LampSignal.BRAKE, RenderQuality()).any(), "the effect is off"
+    assert not gained(LampSignal.BRAKE, RenderQuality(effects=NO_EFFECTS)).any(), "the effect is off"
 
 
 def test_stop_lamps_light_the_road_behind(scene: RenderScene) -> None:

@@ -619,6 +619,28 @@ def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, qualit
     return near_light
 
 
+def view_noise(view: View, device: str = "cpu") -> F32 | None:
+    """Return the noise [H, W] of a view's photosites in standard deviations; None if its sensor has none.
+
+    With it, `ssad.rendering.camera.torch_sensor.develop` gives the image that `render` does, noise and all.
+
+    Args:
+        view: The view, whose sensor has a mosaic.
+        device: Device that draws.
+
+    Raises:
+        ConfigError: The sensor has noise and no mosaic.
+    """
+    if view.sensor.noise == 0.0:
+        return None
+    if not view.sensor.mosaic:
+        raise ConfigError("noise of single photosites needs a sensor with a mosaic")
+    noise = wp.empty((view.camera.height, view.camera.width), dtype=float, device=device)
+    wp.launch(sensing.draw_noise, dim=noise.shape, inputs=[view.seed], outputs=[noise], device=device)
+    drawn: F32 = noise.numpy()
+    return drawn
+
+
 def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:
     """Develop radiance with the sensors of the views.
 

@@ -25,11 +25,10 @@ from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
 from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
-from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.glare import with_lens_effects
-from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.render import Rendering, View, render, view_noise
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
-from ssad.rendering.camera.sensor import SENSOR
+from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
 from ssad.rendering.camera.torch_sensor import (
     PART_LEVELS,
@@ -46,8 +45,6 @@ KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 80  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
 STEP = 2**PART_LEVELS  # px at whose multiples windows begin, so that glare does not depend on them
-LENS = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
-"""Sensor of the recordings, with the light that its lens scatters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +61,8 @@ class TexturableImage:
             [h, w, 3].
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
+        sensor: Sensor of the camera, with the effects of its lens.
+        noise: Noise of the photosites of the part in standard deviations [h, w]; None if there is none.
         glow: Rows and columns of the picture in which light from the textures, scattered by the lens, can change a code
             by more than one.
     """
@@ -76,7 +75,9 @@ class TexturableImage:
     radiance: F32
     exposure: float
     fragments: Any
+    sensor: SensorModel
     glow: Rectangle
+    noise: F32 | None = None
 
     def prepare(
         self,
@@ -119,11 +120,16 @@ class TexturableImage:
             (first_row, last_row), (first_column, last_column) = self.glow
             corners = [first_row * width + first_column, (last_row - 1) * width + last_column - 1]
             touched_pixels = torch.cat([touched_pixels, torch.tensor(corners)])
-        window = ChangedWindow.around(touched_pixels, (1, height, width), SENSOR, quality=quality, step=STEP)
+        behind_lens = replace(self.sensor, glare=0.0, flare=0.0)
+        window = ChangedWindow.around(touched_pixels, (1, height, width), behind_lens, quality=quality, step=STEP)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
-        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image)
+        noise = None
+        if self.noise is not None:
+            noise = _cut(torch.tensor(self.noise), rectangle, window.read[0]).to(device)
+        part = radiance.to(device)
+        return PreparedImage(window, part, self.exposure, device_taps, recorded_image, self.sensor, noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +142,8 @@ class PreparedImage:
         exposure: Factor on the radiance.
         taps: Contribution of each texture to the pixels of the image, by its number.
         before: The whole image as recorded, uint8 [3, H, W].
+        lens: Sensor of the camera, with the effects of its lens.
+        noise: Noise of the photosites of the part, as recorded [h, w]; None if there is none.
     """
 
     window: ChangedWindow
@@ -143,6 +151,8 @@ class PreparedImage:
     exposure: float
     taps: Mapping[int, Taps]
     before: Tensor
+    lens: SensorModel
+    noise: Tensor | None = None
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
         """Return the image with textures on its target, [1, 3, H, W].
@@ -169,7 +179,7 @@ class PreparedImage:
         Args:
             pictures: Of one size, sensor and JPEG quality.
             textures: Number -> linear albedo in 0 to 1, one for each picture [B, 3, h, w].
-            noise: Of each picture, draws the sensor's noise where it changes; None for none there.
+            noise: Of each picture, draws new noise of the sensor where it changes; None for that of the recording.
 
         Returns:
             [B, 3, H, W] in [0, 1], differentiable in the textures.
@@ -208,7 +218,7 @@ class PreparedImage:
         for layer in pictures[0].taps:
             taps = combine_taps([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
             texture_light = retexture(taps, textures[layer], texture_light)
-        return radiance + scatter_parts(texture_light, LENS, corners, (image_height, image_width)), window
+        return radiance + scatter_parts(texture_light, pictures[0].lens, corners, (image_height, image_width)), window
 
     @staticmethod
     def developed(
@@ -218,18 +228,25 @@ class PreparedImage:
         noise: Sequence[torch.Generator] | None,
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
-        noise_sample = None
+        samples = [prepared.noise for prepared in pictures]
         if noise is not None:
+            # Noise is drawn for the image's own window, so that it does not depend on the batch.
             mosaic = window.sensor.mosaic
-            noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
+            shapes = [prepared.part.shape[: 2 if mosaic else 3] for prepared in pictures]
             generators = generators_on_device(noise, radiance.device)
-            for image_noise, prepared, read_rectangle, rng in zip(
-                noise_sample, pictures, window.read, generators, strict=True
+            samples = [
+                torch.randn(shape, generator=rng, device=rng.device)
+                for shape, rng in zip(shapes, generators, strict=True)
+            ]
+        noise_sample = None
+        if (first_sample := samples[0]) is not None:
+            noise_sample = radiance.new_zeros((*radiance.shape[:3], *first_sample.shape[2:]))
+            for image_noise, prepared, read_rectangle, sample in zip(
+                noise_sample, pictures, window.read, samples, strict=True
             ):
                 target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
-                # Noise is drawn for the image's own window, so that it does not depend on the batch.
-                window_shape = prepared.part.shape[:2] if mosaic else prepared.part.shape
-                image_noise[target_slices] = torch.randn(window_shape, generator=rng, device=rng.device)[source_slices]
+                if sample is not None:
+                    image_noise[target_slices] = sample[source_slices]
         exposure = torch.tensor([prepared.exposure for prepared in pictures]).to(radiance)
         recorded_images = torch.stack([prepared.before for prepared in pictures])
         return window.paste(window.develop(radiance, exposure, noise_sample), recorded_images)
@@ -289,7 +306,7 @@ def texturable_images(
         StoreError: The folder cannot be written to.
     """
     cache_folder = _cache_folder(folder, layers, split)
-    rows = image_rows(folder, split)
+    rows, sensor = image_rows(folder, split), recorded_sensor(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
     missing_views = recorded_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
@@ -300,7 +317,16 @@ def texturable_images(
             safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers, device))
         cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
-        yield TexturableImage(file, row, objects, image, **parse_part(cached))
+        yield TexturableImage(file, row, objects, image, sensor=sensor, **parse_part(cached))
+
+
+def recorded_sensor(folder: Path, split: str = "all") -> SensorModel:
+    """Return the sensor of a recording, with the effects of its lens.
+
+    Raises:
+        FormatError: The folder holds no recording of this version.
+    """
+    return with_lens_effects(SENSOR, recording_of(folder, split)["effects"])
 
 
 def uncached_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
@@ -352,15 +378,17 @@ def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], s
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def visible_part(picture: Rendering, device: str = "cpu") -> dict[str, Any]:
-    """Return arrays of the part of a rendering around what shows textures, see `parse_part`.
+def visible_part(picture: Rendering, view: View, device: str = "cpu") -> dict[str, Any]:
+    """Return arrays of the part of a rendered view around what shows textures, see `parse_part`.
 
     It is behind the lens, which scatters the light of the whole picture.
     """
     height, width = picture.radiance.shape[1:3]
+    noise = view_noise(view)
+    assert noise is not None
     fragments = picture.fragments.copy()
     light = torch.from_numpy(picture.radiance[:1]).to(device)
-    lens = with_lens_effects(SENSOR, picture.effects)
+    lens = with_lens_effects(view.sensor, picture.effects)
     background = scatter(light, lens)
     places = torch.from_numpy(fragments["place"].astype(np.int64)).to(device)
     white = torch.from_numpy(np.ascontiguousarray(fragments["light"], np.float32)).to(device)
@@ -380,6 +408,7 @@ def visible_part(picture: Rendering, device: str = "cpu") -> dict[str, Any]:
         "exposure": picture.exposure[0],
         "fragments": fragments,
         "glow": np.array(glow),
+        "noise": noise[top:bottom, left:right],
     }
 
 
@@ -392,13 +421,15 @@ def parse_part(arrays: Mapping[str, Any]) -> dict[str, Any]:
         "exposure": float(arrays["exposure"]),
         "fragments": arrays["fragments"],
         "glow": (tuple(rows), tuple(columns)),
+        "noise": arrays["noise"],
     }
 
 
 def _render_visible_part(
     view: RecordedView, layers: Sequence[TextureLayer | TextureDecal], device: str
 ) -> dict[str, Any]:
-    return visible_part(render(view.scene, [view.with_layers(*layers)]), device)
+    dressed_view = view.with_layers(*layers)
+    return visible_part(render(view.scene, [dressed_view], quality=view.quality), dressed_view, device)
 
 
 def _span(span: tuple[int, int], limit: int) -> tuple[int, int]:
