@@ -283,9 +283,9 @@ def test_at_night_the_glow_of_a_texture_is_part_of_the_picture(glowing: Path) ->
         develop(retexture(taps, torch.full((3, 32, 32), value), radiance), exposure, lens) for value in (0.0, 1.0)
     )
     change = (white - black)[0].amax(0)
-    # Lens and mosaic read 3 px around.
-    change[max(top - 3, 0) : bottom + 3, max(left - 3, 0) : right + 3] = 0.0
-    assert 0.0 < float(change.max()) < 3.0 / 255.0
+    change[top:bottom, left:right] = 0.0
+    # One in the light; the mosaic amplifies differences between neighbours.
+    assert 0.0 < float(change.max()) < 6.0 / 255.0
 
 
 def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:
