@@ -422,12 +422,12 @@ def moment_timestamp(sweep_number: int, time: float) -> int:
 
 
 def drive_with_autopilot(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
-    """Drive an episode with the Autopilot."""
+    """Drive an episode with the Autopilot; the trace has all traffic lights and turn signals."""
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    return rollout(World([episode], {graph.name: graph}), make_system("autopilot"))[0]
+    return rollout(World([episode], {graph.name: graph}), make_system("autopilot"), all_signals=True)[0]
 
 
 @dataclass(slots=True)

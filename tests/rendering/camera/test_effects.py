@@ -19,7 +19,7 @@ from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import PLAIN, VISUAL_RANGE, RenderQuality, SceneWeather, View, render, scene_light
 from ssad.rendering.camera.scene import LampSignal, RenderScene, SceneObject, TextureLayer
 from ssad.rendering.camera.sensor import SensorModel
-from ssad.rendering.camera.texture import retexture, texture_taps
+from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 from ssad.rendering.street import cached_street
@@ -189,6 +189,30 @@ def test_textures_stay_linear_under_all_effects(scene: RenderScene) -> None:
     difference = np.abs(out.numpy() - painted.radiance)[0][body]
     # The probe shows the object itself, black or painted: its own mirror image is not part of the gradient.
     assert np.median(difference) < 1e-5
+
+
+@pytest.mark.parametrize("weather", [replace(NOON, wet=0.8), NIGHT], ids=["wet day", "night"])
+def test_a_texture_of_one_colour_is_a_paint_in_a_street(weather: SceneWeather) -> None:
+    """Under all effects, also where head lamps shine on the lamps of the car that wears it."""
+    pose = np.eye(4)
+    pose[:2, 3] = cached_street("Twinford").lamps[0, :2] + [0.0, 3.0]
+    body, colour = make_body("car", style="sedan", generator=generator("effects")), (0.7, 0.2, 0.4)
+    scene = RenderScene(cached_street("Twinford"), [body])
+
+    def seen(paint: tuple[float, float, float], *layers: TextureLayer) -> View:
+        car = SceneObject(0, pose @ place(8.0, 0.3), paint, 1, layers, signals=LampSignal.BRAKE)
+        return View(CAMERA, pose @ place(0.0, 0.0) @ FORWARD, (car,), weather, lamps=own_lamps(pose, weather))
+
+    painted = render(scene, [seen(colour)], quality=only("all"))
+    textured = render(scene, [seen((0.5, 0.5, 0.5), TextureLayer(0))], quality=only("all"))
+    taps = texture_taps(textured, 16, mask=paint_mask(body, (16, 16)))
+    texture = torch.tensor(colour)[:, None, None].expand(3, 16, 16)
+    out = retexture(taps, texture, torch.tensor(textured.radiance)).numpy()
+    is_body = painted.tag == 1
+    assert is_body.sum() > 100
+    assert out[is_body] == pytest.approx(painted.radiance[is_body], rel=1e-4, abs=1e-4)
+    # Wet roads mirror a grey in place of the texture.
+    assert np.abs(out - painted.radiance).max() < 0.02
 
 
 def test_views_of_one_scene_do_not_share_what_they_mirror(scene: RenderScene) -> None:

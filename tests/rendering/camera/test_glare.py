@@ -200,9 +200,10 @@ def test_lit_lamps_glow_at_night_with_the_light_of_their_luminance() -> None:
             assert (hazy == plain).all()
             continue
         glow = hazy - plain
-        # The lens scatters its shares of the light of 10,500 cd/m^2, less that of the image.
-        shown = plain[plain[..., 0] > 2.0].sum(0)
-        nominal = 4.0 * (np.array([1.0, 0.004, 0.002]) @ [0.2126, 0.7152, 0.0722])
+        # The lens scatters its shares of the light of 10,500 cd/m^2, less that of the image; reflections do not count.
+        colour = np.array([1.0, 0.004, 0.002])
+        shown = plain[..., 0][plain[..., 0] > 1.0].sum() * colour
+        nominal = 4.0 * colour @ [0.2126, 0.7152, 0.0722]
         gain = 10_500 * np.pi / 60 / nominal - 1.0
         expected = shown * gain * glare.glare_weights(HAZY_PINHOLE, 64, 96).sum()
         assert glow.sum((0, 1)) == pytest.approx(expected, rel=0.15)

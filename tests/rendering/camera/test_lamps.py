@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
@@ -19,7 +20,6 @@ from ssad.rendering.camera.effects import ALL_EFFECTS, NO_EFFECTS, select_effect
 from ssad.rendering.camera.lamps import (
     BRAKE_RATIO,
     NIGHT_LUX,
-    TO_LUMINANCE,
     SceneLamp,
     lamp_strength,
     lit_circle,
@@ -287,7 +287,7 @@ def test_a_low_beam_meets_the_limits_of_its_regulation(scene: RenderScene) -> No
     lit, dark = (render(scene, [v], surface=True).surface for v in (view, replace(view, lamps=())))
     assert lit is not None
     assert dark is not None
-    lux = (lit.irradiance[0].astype(float) - dark.irradiance[0]) @ TO_LUMINANCE / NIGHT_LUX
+    lux = (lit.irradiance[0].astype(float) - dark.irradiance[0]) @ LUMINANCE / NIGHT_LUX
     distance = np.linalg.norm(lit.position[0], axis=-1)
     candela = 0.5 * lux * distance**3 / 25.0
     for name, (right, up, least, most) in BEAM_LIMITS.items():
