@@ -63,7 +63,7 @@ _MATERIALS: Final = {
     SemanticClass.TRAFFIC_LIGHT: ("signal_red", "signal_amber", "signal_green", "black_plastic"),
     SemanticClass.TRAFFIC_SIGN: ("sign_white", "sign_red", "sign_blue", "sign_yellow", "sign_back", "sign_ink"),
     SemanticClass.VEGETATION: (
-        *("leaves_round", "leaves_tall", "leaves_birch", "leaves_conifer", "hedge", "bark", "forest", "tree_line"),
+        *("leaves_round", "leaves_tall", "leaves_birch", "leaves_conifer", "twigs", "hedge", "bark", "forest", "tree_line"),
     ),
     SemanticClass.TERRAIN: (
         *("meadow", "dry_grass", "grass", "grass_blades", "soil", "lawn", "hills"),
@@ -113,7 +113,8 @@ class OnboardSemanticCamera:
 
     def _read(self, sight: AgentView, kinds: Sequence[int] | I32) -> U8:
         scene = sight.town.scene
-        rendering = render(scene, [self.onboard.view(sight, self.camera)], linear=False, materials=True)
+        view, quality = self.onboard.view(sight, self.camera), self.onboard.quality
+        rendering = render(scene, [view], quality=quality, linear=False, materials=True)
         assert rendering.material is not None
         by_material = [CLASS_OF_MATERIAL.get(name, SemanticClass.STATIC) for name in scene.material_names]
         # The last entry is that of row -1, the sky.

@@ -26,7 +26,7 @@ NOON = SceneWeather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
 
 
 def visible(
-    vertices: Any, faces: Any, *, width: int = 128, height: int = 96, scale: int = 2, lanes: int = 1
+    vertices: Any, faces: Any, *, width: int = 128, height: int = 96, scale: int = 2, lanes: int = 1, twig: int = 0
 ) -> tuple[Any, Any]:
     """Face [height, width] (-1 none) and inverse depth of the visibility pass for a camera at the origin."""
     count = len(faces)
@@ -38,6 +38,7 @@ def visible(
     inputs = [
         on(vertices, wp.vec3),
         on(faces, wp.int32),
+        on(np.full(count, twig), wp.int32),
         on(np.arange(count), wp.int32),
         on([0, count], wp.int32),
         on([0], wp.int32),
@@ -58,6 +59,39 @@ def visible(
     slot = 0xFFFFFFFF - (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
     near = (keys >> np.uint64(32)).astype(np.uint32).view(np.float32)
     return np.where(keys > 0, slot // 2, -1), np.where(keys > 0, near, 0)
+
+
+def test_a_scene_has_leaves_of_one_size_on_cards_of_twigs_and_no_others() -> None:
+    card = np.array([[-0.65, 0.0, 0.0], [0.0, 0.0, 2.6], [0.65, 0.0, 0.0]])
+    bodies = [
+        build(size * card, [[0, 1, 2]], materials=[replace(GREY, name=name)], material=[0])
+        for size, name in ((1.0, "twigs"), (0.5, "twigs"), (1.0, "grey"))
+    ]
+    large, small, solid = RenderScene(None, bodies).twigs.numpy().tolist()
+    assert (large % 64, large // 64 % 64) == (20, 10)
+    assert (small % 64, small // 64 % 64) == (10, 5)
+    assert large // 4096 != small // 4096
+    assert solid == 0
+
+
+def test_leaves_are_cut_out_of_a_card_and_keep_its_depth_and_form_in_perspective() -> None:
+    face = np.array([[0, 1, 2]])
+    card = np.array([[-0.4, 0.5, 1.0], [0.0, -0.5, 1.4], [0.4, 0.5, 1.0]], np.float32)[::-1].copy()
+    twig = 10 + 64 * 8 + 4096 * 5
+    solid, solid_depth = visible(card, face)
+    leaves, depth = visible(card, face, twig=twig)
+    assert not ((leaves == 0) & (solid < 0)).any()
+    assert 0.3 < (leaves == 0).sum() / (solid == 0).sum() < 0.8
+    np.testing.assert_array_equal(depth[leaves == 0], solid_depth[leaves == 0])
+    other, _ = visible(card, face, twig=twig + 4096)
+    assert (other != leaves).any()
+    # The same card at half the distance and half the size has the same image.
+    np.testing.assert_array_equal(visible(0.5 * card, face, twig=twig)[0], leaves)
+    # A tip three times as far away on the same ray: the outline stays, leaves move, as parts of a plane in perspective.
+    tilted = card.copy()
+    tilted[1] *= 3.0
+    np.testing.assert_array_equal(visible(tilted, face)[0], solid)
+    assert ((visible(tilted, face, twig=twig)[0] == 0) != (leaves == 0)).mean() > 0.02
 
 
 def cast(vertices: Any, faces: Any, *, width: int = 128, height: int = 96, scale: int = 2) -> tuple[Any, Any]:

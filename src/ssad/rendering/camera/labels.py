@@ -223,6 +223,7 @@ def _standalone_pixels(
     inputs = [
         scene.vertices,
         scene.faces,
+        scene.twigs,
         scene.listed,
         wp.array(starts, dtype=int, device=device),
         wp.array(firsts, dtype=int, device=device),

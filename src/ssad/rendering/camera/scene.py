@@ -50,6 +50,7 @@ PATTERNS = {
     "leaves_tall": matter.LEAF,
     "leaves_birch": matter.LEAF,
     "leaves_conifer": matter.LEAF,
+    "twigs": matter.LEAF,
     "bark": matter.GRAIN,
     "roof_tiles": matter.TILE,
     "boards": matter.TILE,
@@ -267,6 +268,7 @@ LAMP_KINDS = {  # kind of lamp of a material by its name
     "brake_lamp": int(light_kernels.BRAKE_LAMP),
     "lamp_light": int(light_kernels.STREET_LAMP),
 }
+LEAF = 0.13  # m from leaf to leaf on a card
 INDICATOR_SHARE = 0.35  # outer share of the width of a head or tail lamp that is its indicator
 CLUSTER_SIDE = 0.35  # m from the axis that a lamp with an indicator reaches: those of motorcycles do not
 NIGHT = {  # added to the emission of a material at night, while lamps are on
@@ -344,6 +346,10 @@ class RenderScene:
         surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = to_device(surface_rows, matter.Surface)
         self.listed = to_device(np.concatenate(listed_faces), wp.int32)
+        self.twigs = to_device(
+            _twigs(np.concatenate(vertices), np.concatenate(faces), self.material_names, np.concatenate(material)),
+            wp.int32,
+        )
         self.geometry = kernels.Geometry()
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
@@ -508,6 +514,21 @@ class RenderScene:
             splits[tile_count + draw] = self.lamp_split(int(bodies.mesh[visible[draw]]))
         layers = ((),) * tile_count + tuple(bodies.objects[object_index].layers for object_index in visible.tolist())
         return DrawCalls(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, splits, layers)
+
+
+def _twigs(vertices: F32, faces: I32, names: Sequence[str], material: I32) -> I32:
+    """Return what the visibility pass cuts out of each face [F]: 0 for nothing.
+
+    A card of leaves has rows and columns of leaves of about `LEAF` m, and one of 64 variations: see `raster.Triangle`.
+    """
+    twigs = np.zeros(len(faces), np.int32)
+    cards = np.flatnonzero(np.isin(material, [index for index, name in enumerate(names) if name == "twigs"]))
+    corners = vertices[faces[cards]]
+    bases = corners[:, 2] - corners[:, 0]
+    heights = np.linalg.norm(corners[:, 1] - 0.5 * (corners[:, 0] + corners[:, 2]), axis=1)
+    rows, columns = (np.clip(np.round(size / LEAF), 2, 63) for size in (heights, np.linalg.norm(bases, axis=1)))
+    twigs[cards] = rows + 64 * columns + 4096 * (cards % 64)
+    return twigs
 
 
 def surface(material: Material) -> tuple[Any, ...]:

@@ -59,6 +59,7 @@ class VisibilityPass:
         inputs = [
             scene.vertices,
             scene.faces,
+            scene.twigs,
             scene.listed,
             starts,
             firsts,

@@ -26,14 +26,14 @@ from ssad.rendering.street.free_ground import FreeGround, sides
 from ssad.rendering.street.markings import paint_markings
 from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
 from ssad.rendering.street.palette import STYLES, TownMaterials, style_of
-from ssad.rendering.street.paving import pave_ground
+from ssad.rendering.street.paving import pave_ground, pave_sidewalks
 from ssad.rendering.street.plots import build_along_streets, fill_blocks
 from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
-from ssad.rendering.street.yards import lay_yards
+from ssad.rendering.street.yards import entrances, lay_yards
 from ssad.world.roads.library import load_town
 
-REVISION = 7  # of the construction: a cached street of another revision is not used
+REVISION = 10  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
@@ -71,6 +71,8 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     plant_trees(builder, free_ground, materials, plots.parks)
     plant_grass(builder, free_ground, materials, street_sides)
     bays = lay_bays(builder, free_ground, materials)
+    yard_entrances = entrances(free_ground, yards.frontages, _f32(bays, 5).astype(np.float64))
+    pave_sidewalks(builder, graph, materials, yard_entrances)
     geometry = join(builder.pieces)
     origin, nx, ny, order, offset = tiles(np.concatenate(builder.owner), geometry.levels)
     return Street(

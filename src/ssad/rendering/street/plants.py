@@ -1,6 +1,6 @@
 """Trees, bushes, hedges and grass: a trunk, dark blobs inside the crown, and leaf cards around them.
 
-A leaf card is a small triangle, longer than wide: the camera has no transparency.
+A leaf card is a small triangle, longer than wide. Its material is called "twigs": the camera cuts leaves out of it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.geometry import cross
+from ssad.core.seeding import generator
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.model import FAR, MID, NEAR
 from ssad.rendering.street.palette import TownMaterials
@@ -69,10 +70,10 @@ BALL, BALL_FACES = _icosahedron()
 
 
 def blob(
-    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14
+    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14, key: str = ""
 ) -> TrianglePiece:
-    """An uneven ellipsoid of 20 triangles, shaded smooth."""
-    rng = materials.generator
+    """An uneven ellipsoid of 20 triangles, shaded smooth; with a `key`, its form takes no draw from the town's generator."""
+    rng = generator(key, *centre.tolist(), *radius.tolist()) if key else materials.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
     directions = BALL @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -89,8 +90,12 @@ def leaves(
     size: float,
     materials: list[int],
     levels: int = NEAR,
+    sparse: bool = False,
 ) -> TrianglePiece:
-    """Leaf cards about `size` m long in the outer half of an ellipsoid, tilted at random, outsides away from it."""
+    """Leaf cards about `size` m long in the outer half of an ellipsoid, tilted at random, outsides away from it.
+
+    `sparse` leaves out every third card, but not its draws: they decide about parking bays, too.
+    """
     rng = style_materials.details
     positions = np.arange(count) + 0.5
     z = 1.0 - 1.9 * positions / count  # few leaves at the underside
@@ -107,13 +112,19 @@ def leaves(
     leaf_normals *= np.sign((leaf_normals * directions).sum(axis=1, keepdims=True) + 1e-9)
     side_axes = cross(leaf_normals, rng.normal(size=(count, 3)))
     half_sizes = 0.5 * size * rng.uniform(0.7, 1.25, (count, 1, 1))
-    vertex_normals = directions / radius * float(np.mean(radius)) + 0.9 * leaf_normals + [0.0, 0.0, 0.2]
+    vertex_normals = directions / radius * float(np.mean(radius)) + 0.6 * leaf_normals + [0.0, 0.0, 0.2]
     # The upper and outer leaves catch more light: lighter greens come first in the table.
     shade = 0.35 * (1.0 - z) + 1.5 * (0.97 - depth)
     material_index = np.clip((shade * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1)
-    return _leaf_cards(
-        centres, leaf_normals, side_axes, half_sizes, vertex_normals, np.array(materials)[material_index], levels=levels
-    )
+    twigs = _twigs(materials, style_materials)[material_index]
+    drawn = np.flatnonzero(positions % 3 < 2) if sparse else np.arange(count)
+    card_arrays = (values[drawn] for values in (centres, leaf_normals, side_axes, half_sizes, vertex_normals, twigs))
+    return _leaf_cards(*card_arrays, levels=levels)
+
+
+def _twigs(greens: list[int], materials: TownMaterials) -> npt.NDArray[np.int64]:
+    """Return the materials of leaf cards with the colours of greens."""
+    return np.array([materials.palette.shade(green, 1.0, "twigs") for green in greens])
 
 
 def _leaf_cards(  # noqa: PLR0917
@@ -147,7 +158,7 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
     if kind == "conifer":
         return _conifer(materials)
     greens = _greens(kind, materials)
-    dark_green = materials.palette.shade(greens[-1], 0.6)
+    dark_green = materials.palette.shade(greens[-1], 0.42)
     height = {"round": rng.uniform(6.0, 9.5), "tall": rng.uniform(9.0, 13.5), "birch": rng.uniform(7.5, 11.0)}[kind]
     radius_shares = {"round": (0.34, 0.36), "tall": (0.15, 0.42), "birch": (0.20, 0.36)}[kind]
     radius = np.array([radius_shares[0], radius_shares[0], radius_shares[1]]) * height * rng.uniform(0.9, 1.12, 3)
@@ -167,15 +178,17 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
         lobe_offset = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), height_offset]) * radius
         lobe_radius = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
         parts += [
-            blob(centre + lobe_offset, 0.86 * lobe_radius, dark_green, materials, levels=NEAR),
-            blob(centre + lobe_offset, 0.9 * lobe_radius, greens[-1], materials, levels=MID, rough=0.2),
+            blob(centre + lobe_offset, 0.76 * lobe_radius, dark_green, materials, levels=NEAR),
+            blob(centre + lobe_offset, 0.8 * lobe_radius, dark_green, materials, levels=MID, rough=0.2),
+            *_shells(centre + lobe_offset, lobe_radius, greens, materials),
             leaves(
                 centre + lobe_offset,
                 lobe_radius,
                 materials,
                 count=leaf_count,
-                size=0.46 * float(lobe_radius.mean()),
+                size=0.66 * float(lobe_radius.mean()),
                 materials=[materials.palette.shade(greens[0], 1.35), *greens],
+                sparse=True,
             ),
             leaves(
                 centre + lobe_offset,
@@ -185,9 +198,19 @@ def tree(kind: str, materials: TownMaterials) -> TrianglePiece:
                 size=0.62 * float(lobe_radius.mean()),
                 materials=greens,
                 levels=MID,
+                sparse=True,
             ),
         ]
     return join(parts)
+
+
+def _shells(centre: F64, radius: F64, greens: list[int], materials: TownMaterials) -> list[TrianglePiece]:
+    """Two shells of leaves around the dark inside of a crown, the outer one lighter."""
+    dark, light = _twigs([greens[-1], greens[1]], materials).tolist()
+    return [
+        blob(centre, 0.97 * radius, dark, materials, levels=VISIBLE, rough=0.16, key="inner leaves"),
+        blob(centre, 1.05 * radius, light, materials, levels=NEAR, rough=0.2, key="outer leaves"),
+    ]
 
 
 def _conifer(materials: TownMaterials) -> TrianglePiece:
@@ -218,19 +241,26 @@ def _conifer(materials: TownMaterials) -> TrianglePiece:
             ]
         )
         vertices = np.vstack([rim, [[0.0, 0.0, min(upper, height)]]])
+        inside = [0.84, 0.84, 1.0]
         indices = np.arange(side_count)
         outer_normals = np.column_stack([np.cos(angles), np.sin(angles), np.full(side_count, 0.6)])
         parts.append(
             smooth(
-                vertices,
+                vertices * inside,
                 np.stack([indices, (indices + 1) % side_count, np.full(side_count, side_count)], 1),
                 np.vstack([outer_normals, [[0, 0, 1]]]),
-                greens[whorl_index % 2],
+                materials.palette.shade(greens[whorl_index % 2], 0.7),
                 levels=VISIBLE,
             )
         )
+        # Base and tip as of a card: rows of leaves from the rim to the top.
+        shell_faces = np.stack([(indices + 1) % side_count, np.full(side_count, side_count), indices], 1)
+        shell_normals = np.vstack([outer_normals, [[0, 0, 1]]])
+        for shell_size, green, levels in ((0.97, whorl_index % 2, NEAR), (1.08, (whorl_index + 1) % 2, VISIBLE)):
+            shell = vertices * [shell_size, shell_size, 1.0]
+            parts.append(smooth(shell, shell_faces, shell_normals, _twigs(greens, materials)[green], levels=levels))
         parts.append(_sprays(materials, (lower, min(upper, height)), radius, greens))
-        lower_vertices = np.vstack([rim, [[0.0, 0.0, lower + 0.3 * radius]]])
+        lower_vertices = np.vstack([rim * inside, [[0.0, 0.0, lower + 0.3 * radius]]])
         lower_faces = np.stack([(indices + 1) % side_count, indices, np.full(side_count, side_count)], 1)
         lower_normals = np.broadcast_to([0.0, 0.0, -1.0], lower_vertices.shape)
         parts.append(
@@ -254,9 +284,9 @@ def _sprays(materials: TownMaterials, z: tuple[float, float], radius: float, gre
     normals = np.column_stack([np.cos(angles) * -tilt, np.sin(angles) * -tilt, np.ones(count)])
     normals += 0.25 * rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    half = radius * rng.uniform(0.12, 0.24, (count, 1, 1))
+    half = radius * rng.uniform(0.18, 0.30, (count, 1, 1))
     shading = outwards + [0.0, 0.0, 0.6] + 0.3 * normals
-    return _leaf_cards(centres, normals, along, half, shading, np.array(greens)[rng.integers(0, 2, count)])
+    return _leaf_cards(centres, normals, along, half, shading, _twigs(greens, materials)[rng.integers(0, 2, count)])
 
 
 def bush(materials: TownMaterials) -> TrianglePiece:
@@ -267,9 +297,10 @@ def bush(materials: TownMaterials) -> TrianglePiece:
     centre = np.array([0.0, 0.0, 0.85 * radius[2]])
     return join(
         [
-            blob(centre, 0.8 * radius, materials.palette.shade(greens[-1], 0.7), materials, levels=NEAR),
+            blob(centre, 0.74 * radius, materials.palette.shade(greens[-1], 0.6), materials, levels=NEAR),
             blob(centre, 0.94 * radius, greens[-1], materials, levels=MID, rough=0.2),
-            leaves(centre, radius, materials, count=50, size=0.36, materials=greens),
+            *_shells(centre, radius, greens, materials)[:1],
+            leaves(centre, radius, materials, count=50, size=0.44, materials=greens),
         ]
     )
 
@@ -279,16 +310,18 @@ def hedge(materials: TownMaterials, material: int) -> TrianglePiece:
     greens = [materials.palette.shade(material, factor) for factor in (1.6, 1.0, 0.75)]
     return join(
         [
-            box((-0.52, -0.29, -0.1), (0.52, 0.29, 0.93), greens[2], levels=NEAR),
+            box((-0.50, -0.27, -0.1), (0.50, 0.27, 0.91), materials.palette.shade(material, 0.5), levels=NEAR),
             box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), material, levels=MID),
-            _hedge_leaves(materials.generator, 15, (0.12, 0.13), greens),
-            _hedge_leaves(materials.details, 18, (0.08, 0.17), greens),
+            box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), _twigs(greens, materials)[2], levels=NEAR),
+            box((-0.54, -0.36, -0.1), (0.54, 0.36, 1.0), _twigs(greens, materials)[1], levels=NEAR),
+            _hedge_leaves(materials.generator, 15, (0.16, 0.18), _twigs(greens, materials)),
+            _hedge_leaves(materials.details, 18, (0.12, 0.22), _twigs(greens, materials)),
         ]
     )
 
 
 def _hedge_leaves(
-    rng: np.random.Generator, count: int, half_size: tuple[float, float], greens: list[int]
+    rng: np.random.Generator, count: int, half_size: tuple[float, float], twigs: npt.NDArray[np.int64]
 ) -> TrianglePiece:
     """Leaf cards on both sides and, each third of them, on the top of a metre of hedge."""
     centres = np.column_stack(
@@ -306,7 +339,7 @@ def _hedge_leaves(
     side_axes = cross(leaf_normals, np.hstack([np.sin(turns), np.cos(turns), 0.9 + 0.0 * turns]))
     half_sizes = np.linspace(*half_size, count)[:, None, None]
     shading = outwards + 0.4 * leaf_normals
-    colours = np.array(greens)[np.clip(shade.astype(int), 0, len(greens) - 1)]
+    colours = twigs[np.clip(shade.astype(int), 0, len(twigs) - 1)]
     return _leaf_cards(centres, leaf_normals, side_axes, half_sizes, shading, colours)
 
 

@@ -14,19 +14,25 @@ REGISTERS = 64  # a CUDA thread's, at most: more threads are resident, and 128 v
 
 NONE = wp.constant(wp.uint64(0))
 LOW = wp.constant(0.21)  # m above the ground (or a body's base): what is lower casts no shadow
+LEAF_LENGTH = wp.constant(0.62)  # half the length of a leaf, in cells of its card
+LEAF_WIDTH = wp.constant(0.30)  # half its width
 # The slot is stored as LAST - slot, so that of equal depths the lower slot wins.
 LAST = wp.constant(wp.uint64(4294967295))
 
 
 @wp.struct
 class Triangle:
-    """Corners as (x, y, inverse depth) in samples; its view; its slot, which identifies it in the view."""
+    """Corners as (x, y, inverse depth) in samples; its view; its slot, which identifies it in the view.
+
+    twig: 0 for a solid triangle; for a card of leaves, rows + 64 columns of leaves + 4096 variation.
+    """
 
     a: wp.vec3
     b: wp.vec3
     c: wp.vec3
     view: int
     slot: int
+    twig: int
 
 
 @wp.func
@@ -74,6 +80,62 @@ def edge_crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
 
 
 @wp.func
+def leaf_draw(column: int, row: int, seed: int) -> int:
+    """Return 16 pseudo-random bits for a cell of a card."""
+    bits = wp.uint32(column) * wp.uint32(374761393) + wp.uint32(row) * wp.uint32(668265263)
+    bits = bits + wp.uint32(seed) * wp.uint32(1540483477)
+    bits = (bits ^ (bits >> wp.uint32(13))) * wp.uint32(1274126177)
+    return int((bits >> wp.uint32(15)) & wp.uint32(65535))
+
+
+@wp.func
+def is_on_leaf(t: Triangle, x: float, y: float) -> bool:
+    """Return whether a sample of a card lies on a leaf.
+
+    Two grids of cells cover the card, from the edge between a and c to the corner b. Each cell has a leaf with a
+    direction of its own if the middle of the leaf is on the card: no leaf is cut by an edge of the card.
+    """
+    ux = t.b[0] - t.a[0]
+    uy = t.b[1] - t.a[1]
+    vx = t.c[0] - t.a[0]
+    vy = t.c[1] - t.a[1]
+    px = x - t.a[0]
+    py = y - t.a[1]
+    area = ux * vy - uy * vx
+    tip = (px * vy - py * vx) / area
+    right = (ux * py - uy * px) / area
+    # Shares of the corners on the card, not in the image: divided by depth, leaves keep their form in perspective.
+    left = (1.0 - tip - right) * t.a[2]
+    tip = tip * t.b[2]
+    right = right * t.c[2]
+    total = left + tip + right
+    rows = float(t.twig % 64)
+    columns = float((t.twig / 64) % 64)
+    seed = t.twig / 4096
+    u = (right + 0.5 * tip) / total * columns
+    v = tip / total * rows
+    for grid in range(2):
+        offset = 0.5 * float(grid)
+        column = wp.floor(u + offset)
+        row = wp.floor(v + offset)
+        bits = leaf_draw(int(column), int(row), seed + 97 * grid)
+        # Direction by a parabola in place of sine and cosine, which differ between devices.
+        turn = float(bits & 255) / 256.0 - 0.5
+        lean = 1.0 - 4.0 * turn * turn
+        norm = 1.0 / wp.sqrt(4.0 * turn * turn + lean * lean)
+        middle_u = column - offset + 0.35 + 0.3 * float((bits >> 8) & 15) / 15.0
+        middle_v = row - offset + 0.35 + 0.3 * float((bits >> 12) & 15) / 15.0
+        along = ((u - middle_u) * 2.0 * turn + (v - middle_v) * lean) * norm
+        across = wp.abs((u - middle_u) * lean - (v - middle_v) * 2.0 * turn) * norm
+        if across < LEAF_WIDTH * (1.0 - along * along / (LEAF_LENGTH * LEAF_LENGTH)):
+            height = middle_v / rows
+            aside = wp.abs(middle_u / columns - 0.5)
+            if height > 0.0 and aside < 0.5 * (1.0 - height):
+                return True
+    return False
+
+
+@wp.func
 def fill_row(t: Triangle, y: int, samples: wp.array3d(dtype=wp.uint64), gx: float, gy: float):
     """Enter a triangle into one row of samples."""
     sample_y = float(y) + 0.5
@@ -106,7 +168,8 @@ def fill_row(t: Triangle, y: int, samples: wp.array3d(dtype=wp.uint64), gx: floa
         key = (wp.uint64(wp.cast(inverse_depth, wp.uint32)) << wp.uint64(32)) | slot_bits
         # Cheap test first: an atomic operation is only needed where the key can win.
         if key > samples[t.view, y, x]:
-            wp.atomic_max(samples, t.view, y, x, key)
+            if t.twig == 0 or is_on_leaf(t, float(x) + 0.5, sample_y):
+                wp.atomic_max(samples, t.view, y, x, key)
 
 
 @wp.func
@@ -154,6 +217,7 @@ def enter(
 def fill(
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array2d(dtype=int),
+    twigs: wp.array(dtype=int),
     listed: wp.array(dtype=int),
     starts: wp.array(dtype=int),
     firsts: wp.array(dtype=int),
@@ -174,7 +238,7 @@ def fill(
 
     Triangles whose extent has more than `largest` samples are listed in `large` instead while there is room.
 
-    owners: the draw and the face of each index. A parallel projection is the sun: the ground casts no shadow.
+    twigs: of each face, see `Triangle`. owners: the draw and the face of each index. A parallel projection is the sun: the ground casts no shadow.
     Each draw has `lanes` threads, which take its faces in turn.
     """
     draw, lane = wp.tid()
@@ -210,6 +274,7 @@ def fill(
                 triangle = Triangle()
                 triangle.view = view
                 triangle.slot = 2 * index
+                triangle.twig = twigs[face]
                 triangle.a = project_point(p, focal, scale, ortho)
                 if q[2] >= plane:
                     triangle.b = project_point(q, focal, scale, ortho)
