@@ -5,8 +5,8 @@
 
 It perceives other road users as every perceiving driver does. It steers without the map; speed limit and traffic lights
 are those of the observation. With a set speed it reads the speed limit from signs in its camera instead
-(`ssad.drivers.lane_keeping.limit_signs`). Where no markings are in view, it extrapolates the last lane by its own motion. After
-`PATIENCE` it slows down and stops, as systems do whose driver does not take over.
+(`ssad.drivers.lane_keeping.limit_signs`). Where no markings are in view, it extrapolates the last lane by its own
+motion. After `PATIENCE` it slows down and stops, as systems do whose driver does not take over.
 """
 
 from __future__ import annotations
