@@ -11,14 +11,14 @@ from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
-from ssad.core.types import F64, Bool, Episode
+from ssad.core.types import F64, Episode
 from ssad.rendering.bodies import BODIES, make_body
 from ssad.rendering.bodies.sign_stickers import apply_sticker, cover_sign
 from ssad.rendering.camera.lamps import AHEAD, SceneLamp
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_edit import StreetEdit
-from ssad.rendering.street_signs import KINDS, LIMIT_SIGN
+from ssad.rendering.street_signs import KINDS, LIMIT_SIGN, limit_signs_of_route
 from ssad.scenarios.static.perturbation import EGO, Perturbation
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ SIGNS: Final = {"stop": "stop_sign", "yield": "yield_sign"}
 LIMIT: Final = "limit"
 FIGURES: Final = tuple(BODIES[LIMIT_SIGN].styles)
 ROUTE_DISTANCE: Final = 25.0  # m from a route within which a sign or signal head belongs to it
-FACING: Final = 0.7  # least cosine between the traffic that a speed-limit sign faces and the route beside it
 HEAD_LUMENS: Final = (30.0, 100.0, 300.0, 1000.0, 3000.0)  # by severity
 HEAD_LIGHTS: Final = {"red": (1.0, 0.03, 0.02), "green": (0.03, 1.0, 0.25), "white": (1.0, 0.98, 0.95)}
 HEAD_SIZE: Final = (0.3, 0.9)  # m, width and height that the light covers
@@ -109,12 +108,10 @@ class SignChange(Perturbation):
             return None
         points = route.xy.astype(np.float64)
         if self._is_limit:
-            rows = cached_street(town).limit_signs.astype(np.float64)
-            rows = rows[np.isin(rows[:, 4], [float(figures) for figures in self._changed_figures()])]
-            places = rows[_faces_route(rows, points), :2]
-        else:
-            kinds = {name: number for number, name in KINDS.items()}
-            places = town.sign_xy[town.sign_kind == kinds[SIGNS[self.sign]]].astype(np.float64).reshape(-1, 2)
+            signs = limit_signs_of_route(cached_street(town).limit_signs, points, within=ROUTE_DISTANCE)
+            return EGO if np.isin(signs[:, 1], [float(figures) for figures in self._changed_figures()]).any() else None
+        kinds = {name: number for number, name in KINDS.items()}
+        places = town.sign_xy[town.sign_kind == kinds[SIGNS[self.sign]]].astype(np.float64).reshape(-1, 2)
         return EGO if near_route(points, places) else None
 
     def bodies(self) -> dict[str, Mesh | None]:
@@ -145,16 +142,6 @@ class SignChange(Perturbation):
 def _standard_body(kind: str, style: str) -> Mesh:
     size = BODIES[kind].styles[style].size
     return make_body(kind, style=style, size=size, generator=generator("changed sign", kind))
-
-
-def _faces_route(rows: F64, route: F64) -> Bool:
-    """Return whether each sign [M, 5] (x, y, yaw of its traffic, ...) faces the traffic of a route [N, 2] beside it."""
-    if not len(rows):
-        return np.zeros(0, bool)
-    nearest = np.hypot(*np.moveaxis(rows[:, None, :2] - route[None, :-1], -1, 0)).argmin(1)
-    along = np.diff(route, axis=0)[nearest]
-    heading = along / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
-    return np.asarray(np.cos(rows[:, 2]) * heading[:, 0] + np.sin(rows[:, 2]) * heading[:, 1] > FACING)
 
 
 @dataclass(frozen=True)
