@@ -135,7 +135,9 @@ class TargetRecording:
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
             for one in recorded_views(folder, split="test", selected_keys=names):
-                picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, objects=())])
+                picture, street = (
+                    render(one.scene, [view], quality=one.quality) for view in (one.view, replace(one.view, objects=()))
+                )
                 light, behind = (
                     np.minimum(p.radiance[0] * p.exposure[0], BRIGHTEST).mean(-1) for p in (picture, street)
                 )

@@ -44,7 +44,7 @@ def rear(clip: RelightableImage) -> tuple[float, float]:
     picture = clip.lit()
     back = -0.5 * clip.target.length
     on_it = ((picture.position[..., 0] - back).abs() < 0.3) & (picture.normal[..., 0] < -0.7)
-    surface = render(clip.scene, [clip.view.view], surface=True).surface
+    surface = render(clip.scene, [clip.view.view], quality=clip.view.quality, surface=True).surface
     assert surface is not None
     (top, left), (high, wide) = picture.corner, picture.radiance.shape[:2]
     light = surface.irradiance[0, top : top + high, left : left + wide][on_it.numpy()].mean(-1)

@@ -15,6 +15,10 @@ from helpers.plugin import install
 
 from ssad.cli import main
 from ssad.core.version import __version__
+from ssad.recorders import nuscenes, target_images
+from ssad.recorders.nuscenes import Recording
+from ssad.recorders.target_recording import TargetRecording
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS
 
 COMMANDS = ("run", "plan", "report", "compare", "replay", "shift", "score", "record", "list", "import", "doctor")
 
@@ -214,8 +218,29 @@ def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (["--clips", "drive", "--scenes", "3"], "--scenes cannot be used with --clips"),
         (["--clips", "orbit", "--width", "640"], "--width cannot be used with --clips"),
         (["--images", "5"], "--images can only be used with --clips"),
+        (["--effects", "haze,fog-lamp"], "unknown effect of the rendering 'fog-lamp'"),
     ],
 )
 def test_record_refuses_options_that_would_do_nothing(words: list[str], message: str, tmp_path: Path) -> None:
     fails(ssad("record", tmp_path / "x", *words), message)
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "effects"),
+    [
+        ([], DEFAULT_EFFECTS),
+        (["--effects", "none"], NO_EFFECTS),
+        (["--effects", "haze, flare"], {"haze", "flare"}),
+        (["--effects", "lit-signals", "--clips", "drive"], {"lit-signals"}),
+    ],
+)
+def test_record_takes_the_effects_of_the_rendering(
+    words: list[str], effects: frozenset[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings: list[Recording | TargetRecording] = []
+    for module, name in ((nuscenes, "record_nuscenes"), (target_images, "record_target_images")):
+        monkeypatch.setattr(module, name, lambda recording, **_: recordings.append(recording))
+    done = ssad("record", tmp_path / "x", *words)
+    assert done.returncode == 0, done.stderr
+    assert recordings[0].effects == effects

@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,15 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.recorders import nuscenes
 from ssad.recorders.drives import MIX, drive_street, make_drive, thin_shares
 from ssad.recorders.nuscenes import AHEAD, Recording, drive_with_autopilot, record_nuscenes
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.bodies import make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, towing_vehicle
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS, select_effects
+from ssad.rendering.camera.render import RenderQuality
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.scene_objects import CARS, RACK, SceneObjects, place_objects
 from ssad.rendering.street import cached_street
@@ -128,6 +132,29 @@ def test_same_bytes_for_any_number_of_workers_and_after_a_stop(recorded: Path, t
     assert contents(again) == contents(recorded)
     with pytest.raises(StoreError, match="another recording"):
         record_nuscenes(Recording(again, **SMALL))
+    with pytest.raises(StoreError, match="another recording"):
+        record_nuscenes(replace(todo, effects=NO_EFFECTS))
+
+
+def test_images_have_the_effects_of_their_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nights have a class of street lighting only with its effect."""
+    qualities = []
+
+    def render(*_: object, quality: RenderQuality, linear: bool) -> None:
+        qualities.append(quality)
+        raise StopIteration
+
+    monkeypatch.setattr(nuscenes, "render", render)
+    moment: Any = SimpleNamespace(views=[None])
+    for effects in (NO_EFFECTS, select_effects("haze", "flare"), DEFAULT_EFFECTS):
+        recording = Recording(tmp_path, effects=effects)
+        with pytest.raises(RuntimeError, match="StopIteration"):
+            next(nuscenes._render_moments(None, [moment], None, 0, recording))  # type: ignore[arg-type]
+        assert qualities[-1].effects == effects
+        nights = [nuscenes.draw_weather((number,), "night", effects=effects).lighting for number in range(9)]
+        assert any(nights) == ("street-lighting" in effects)
+    with pytest.raises(ConfigError, match="unknown effect"):
+        Recording(tmp_path, effects=frozenset({"fog lamp"}))
 
 
 @pytest.mark.slow

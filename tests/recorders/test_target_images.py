@@ -54,6 +54,7 @@ from ssad.recorders.viewpoints import (
     shuffled_cells,
     weather_name,
 )
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, NO_EFFECTS
 from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import TextureLayer
@@ -327,13 +328,14 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
     """Each row gives scene, view, target and labels; what is rendered is what was stored."""
     folder = request.getfixturevalue(mode)
     rows = read(folder, "test")["images"]
+    assert set(read(folder)["info"]["recording"]["effects"]) == DEFAULT_EFFECTS
     with plain_bodies() if mode == "drives" else contextlib.nullcontext():
         again = list(recorded_views(folder, split="test"))
     assert [v.file for v in again] == [row["file_name"] for row in rows]
     scenes = {(v.row["town"], v.row["part"], v.row["attempt"], id(v.scene)) for v in again}
     assert len(scenes) == len({key[:3] for key in scenes}), "pictures of a drive share a scene"
     for seen in again:
-        picture = render(seen.scene, [seen.view])
+        picture = render(seen.scene, [seen.view], quality=seen.quality)
         assert encode_jpeg(picture.image[0], 92, "420") == (folder / "images" / seen.file).read_bytes()
         labels = label_image(seen.scene, seen.view, picture)
         target = next(o for o in seen.objects if o["target"])
@@ -481,7 +483,13 @@ def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_pa
 
 
 def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path) -> None:
-    for changes in ({"seed": 1}, {"size": 168}, {"target": TargetCar("van")}, {"images": PAIRS[:1]}):
+    for changes in (
+        {"seed": 1},
+        {"size": 168},
+        {"target": TargetCar("van")},
+        {"images": PAIRS[:1]},
+        {"effects": NO_EFFECTS},
+    ):
         with pytest.raises(StoreError, match="another recording") as error:
             record_target_images(todo(drives, "drive", **changes), workers=0)
         assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Stop and yield signs of drives: where they stand, which way they look, what of them is labelled."""
+"""Stop, yield and speed-limit signs of drives: where they stand, which way they look, what of them is labelled."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 
+from ssad.core.geometry import in_polygon
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
@@ -111,8 +112,41 @@ def test_the_plate_is_labelled_and_the_post_is_not() -> None:
         assert low[2] > 1.8
         assert cast.meshes[post.meshes[0]].bounds()[0][2] == pytest.approx(0.0, abs=1e-6)
         assert np.array_equal(plate.track, post.track)
-    kinds = {kind: label_of(kind) for kind in ("stop_sign", "yield_sign", "", "car", "barrier")}
-    assert kinds == {"stop_sign": 10, "yield_sign": None, "": None, "car": 0, "barrier": 9}
+    kinds = {kind: label_of(kind) for kind in ("stop_sign", "yield_sign", "limit_sign", "", "car", "barrier")}
+    assert kinds == {"stop_sign": 10, "yield_sign": None, "limit_sign": None, "": None, "car": 0, "barrier": 9}
+
+
+@pytest.mark.parametrize("town", ["Oldmarket", "Larkhill"])
+def test_speed_limit_signs_show_the_limit_of_their_road_clear_of_roads_and_crossings(town: str) -> None:
+    graph, limit_signs = ground(town)[0], cached_street(load_town(town)).limit_signs.astype(np.float64)
+    assert len(limit_signs) > 20
+    driving = graph.kind[np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))] == LaneType.DRIVING
+    limits = np.repeat(graph.speed_limit, np.diff(graph.offset))[driving]
+    for x, y, yaw, _, limit in limit_signs:
+        gaps = np.hypot(*(graph.xy[driving] - [x, y]).T) - 0.5 * graph.width[driving]
+        assert gaps.min() > 0.6
+        nearest = int(gaps.argmin())
+        assert np.cos(graph.yaw[driving][nearest] - yaw) > 0.9
+        assert limit == pytest.approx(3.6 * limits[nearest], abs=5.0)
+        assert limit % 10 == 0
+        for crossing in range(len(graph.crosswalk_offset) - 1):
+            assert not in_polygon(np.array([[x, y]]), graph.crosswalk(crossing).astype(np.float64))[0]
+
+
+def test_speed_limit_signs_change_no_other_sign() -> None:
+    graph, rows = ground("Oldmarket")[0], cached_street(load_town("Oldmarket")).limit_signs
+    way = graph.sign_xy.astype(np.float64)
+    plain, limited = (
+        list(street_signs(graph, way, clear_ground("Oldmarket"), key=(0,), many=True, detail=0, limit_signs=limits))
+        for limits in (None, rows)
+    )
+    assert [(s.kind, s.style, s.pose) for s in limited[: len(plain)]] == [(s.kind, s.style, s.pose) for s in plain]
+    limit_signs = limited[len(plain) :]
+    assert limit_signs
+    assert {(sign.kind, sign.style) for sign in limit_signs} == {("limit_sign", "30")}
+    for sign in limit_signs:
+        row = rows[np.hypot(*(rows[:, :2] - sign.pose[:2]).T).argmin()]
+        assert np.cos(sign.pose[2] - row[2]) < -0.9, "it looks at who comes"
 
 
 def test_plate_and_post_make_up_the_body() -> None:

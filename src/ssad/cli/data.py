@@ -198,6 +198,13 @@ def record(
             help="For training data: vary paint, dirt, cameras, colours, noise and compression.",
         ),
     ] = "none",
+    effects: Annotated[
+        str,
+        typer.Option(
+            metavar="default|all|none|NAME,...",
+            help="Effects of the rendering. Only lit-signals was on in earlier versions.",
+        ),
+    ] = "default",
     device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
     workers: Workers = None,
     ray: Ray = None,
@@ -210,6 +217,7 @@ def record(
     from ssad.engine.progress import LiveProgress
     from ssad.recorders.nuscenes import Recording, record_nuscenes
     from ssad.recorders.randomisation import parse_randomisation
+    from ssad.rendering.camera.effects import select_effects
 
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -220,7 +228,7 @@ def record(
         parameter_source = context.get_parameter_source(name)
         if parameter_source is not None and parameter_source.name == "COMMANDLINE":
             raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
-    randomisation = parse_randomisation(randomise)
+    randomisation, shown_effects = parse_randomisation(randomise), select_effects(*names(effects))
     unit = "parts" if clips is not None else "scenes"
     with LiveProgress("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
@@ -239,6 +247,7 @@ def record(
                 device=pick_device(device),
                 streets=streets,
                 randomisation=randomisation,
+                effects=shown_effects,
             )
             record_target_images(target_recording, workers=workers, ray=ray, progress=progress.show)
             message = (
@@ -258,6 +267,7 @@ def record(
                 device=pick_device(device),
                 streets=streets,
                 randomisation=randomisation,
+                effects=shown_effects,
             )
             record_nuscenes(recording, workers=workers, ray=ray, progress=progress.show)
             scene_count = counted(len(recording.towns) * scenes, "scene")

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ssad.core.colours import linear_to_srgb, srgb_to_linear
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.image_files import (
     ImageFile,
@@ -105,15 +106,14 @@ def add_caption(image: U8, caption: str, width: int) -> U8:
 
 def decode_srgb(image: U8) -> F32:
     """Return the linear values of an sRGB image, 0 to 1."""
-    share = image.astype(np.float32) / 255.0
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    linear: F32 = srgb_to_linear(image.astype(np.float32) / 255.0)
+    return linear
 
 
 def encode_srgb(linear: F32) -> U8:
     """Return the sRGB image of linear values; values above 1 become white."""
-    clipped = np.clip(linear, 0.0, 1.0)
-    share = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * share).astype(np.uint8)
+    codes: U8 = np.rint(255.0 * linear_to_srgb(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
+    return codes
 
 
 def save_picture(path: Path, image: U8) -> None:

@@ -10,6 +10,7 @@ from ssad.core.errors import ConfigError, MapError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import (
+    F64,
     Controller,
     Episode,
     EpisodeAgent,
@@ -18,20 +19,25 @@ from ssad.core.types import (
     Pose,
     Route,
     Scenario,
-    SignalPlan,
+    SignalState,
 )
 from ssad.rendering.scene_objects import thin_shares
 from ssad.rendering.street import STYLES, Street, build_street, cached_street
-from ssad.scenarios.dynamic.episode import forced_signals
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
+from ssad.world.episode_arrays import YELLOW, signal_programs
 from ssad.world.models import model
 from ssad.world.roads.router import random_route
+from ssad.world.world import signal_states
 
 TRAFFIC_RANGE = 120.0  # m from the ego's way within which traffic starts
 ROUTE_RANGE = 260.0  # m of the ego's way that counts for this: what is driven in 30 s
 MAX_VEHICLES = 44  # vehicles
 TOWN_SPEED = 12.0  # m/s that a driver who wants the most drives in town
 FAST = 21.0  # m/s: on roads with a higher limit everybody wants to drive faster in proportion
+EGO_ACCELERATION = 2.0  # m/s^2 from its start to the speed that it wants
+ARRIVAL_MARGIN = 3.0  # s before the end of green from which the ego may come too late
+MAX_WAIT = 5.0  # s that the ego waits at red
+MAX_CYCLE = 3600.0  # s within which the moments of short drives are drawn: many cycles
 ROUTE_TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
@@ -75,9 +81,9 @@ def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> 
 
 
 def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, streets: str = "town") -> Episode:
-    """One drive: ego first, all on Autopilot, signals green. Deterministic in the key. streets: see `thin_shares`.
+    """One drive: ego first, all on Autopilot, signals as `drive_signals` has them. Deterministic in the key.
 
-    MapError: the town has no road to drive on.
+    streets: see `thin_shares`. MapError: the town has no road to drive on.
     """
     body_shares = thin_shares(MIX, streets)
     rng = generator("drive", graph.name, *key)
@@ -140,8 +146,61 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
     steps = math.ceil(seconds / 0.1) + 2
     limits = EpisodeLimits(max_steps=steps, max_time=2 * seconds + 60)
     scenario = Scenario(f"drive/{drive_name}", "Custom", graph.name, end_poses, limits=limits)
-    signals = forced_signals(graph, route, SignalPlan(ego="green", others="green", until=1e6), whole_town=True)
+    signals = drive_signals(graph, route, speed=ego_speed, seconds=seconds, key=key)
     return Episode(f"drive/{graph.name}/{drive_name}", scenario, graph.name, tuple(agents), signals, 1e6, limits)
+
+
+def drive_signals(
+    graph: LaneGraph, route: Route, *, speed: float, seconds: float, key: tuple[object, ...]
+) -> dict[int, SignalState]:
+    """Return the states that signals are forced to, so that the ego need not stand at red for long.
+
+    All signals follow their programs, except at junctions that the ego reaches at the wrong moment: there its phase
+    stays green and the others stay red. Programs start with the drive, so that short drives would all show the same
+    states. In those, each junction stays as it is at a drawn moment.
+
+    Args:
+        graph: Lane graph of the town.
+        route: The ego's route.
+        speed: Speed that the ego wants to drive, m/s; it starts from rest.
+        seconds: Length of the drive, s.
+        key: Key of the random draws.
+
+    Returns:
+        Signal index of the town -> state; signals that follow their program are omitted.
+    """
+    programs = signal_programs(graph).astype(np.float64)
+    forced = _drawn_states(graph, programs, generator("drive signals", graph.name, *key)) if seconds < YELLOW else {}
+    junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
+    distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route.xy, axis=0).T))])
+    reached_junctions: set[int] = set()
+    for entry in (np.flatnonzero((junction[1:] >= 0) & (junction[1:] != junction[:-1])) + 1).tolist():
+        arrival = float(distances[entry]) / speed + 0.5 * speed / EGO_ACCELERATION
+        junction_signals = np.flatnonzero((graph.signal_junction == junction[entry]) & ~graph.signal_virtual)
+        approach_signals = graph.stop_signal[graph.stop_lane == route.lane[entry - 1]]
+        ego_signals = np.intersect1d(approach_signals, junction_signals)
+        if arrival > seconds or not len(ego_signals) or int(junction[entry]) in reached_junctions:
+            continue
+        reached_junctions.add(int(junction[entry]))
+        cycle, green_start, green, _ = programs[ego_signals[0]].tolist()
+        time_since_green = (arrival - green_start) % cycle
+        is_passable = time_since_green < green - ARRIVAL_MARGIN or time_since_green > cycle - MAX_WAIT
+        if is_passable and not forced:
+            continue
+        for signal in junction_signals.tolist():
+            is_ego_phase = graph.signal_phase[signal] == graph.signal_phase[ego_signals[0]]
+            forced[signal] = SignalState.GREEN if is_ego_phase else SignalState.RED
+    return forced
+
+
+def _drawn_states(graph: LaneGraph, programs: F64, draws: np.random.Generator) -> dict[int, SignalState]:
+    """Return the states of all signals with a program, each junction at a moment of its own."""
+    signal_count = len(programs)
+    junctions, junction_index = np.unique(graph.signal_junction, return_inverse=True)
+    moments = draws.uniform(0.0, MAX_CYCLE, len(junctions))[junction_index]
+    unforced = np.full((signal_count, 1), -1, np.int32)
+    states = signal_states(programs[:, None], unforced, np.zeros(signal_count, np.float32), moments)[:, 0]
+    return {signal: SignalState(int(states[signal])) for signal in np.flatnonzero(programs[:, 0] > 0.0).tolist()}
 
 
 def _long_route(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator) -> Route:

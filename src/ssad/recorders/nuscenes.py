@@ -7,7 +7,7 @@ stopped at any moment and resumed, and the bytes do not depend on the number of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -34,10 +34,10 @@ from ssad.recorders.drives import check_streets, drive_street, make_drive
 from ssad.recorders.parts import TIME_LIMIT, PartsFolder
 from ssad.recorders.randomisation import NO_RANDOMISATION, CameraDraw, Randomisation, describe_bodies
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, category_of
-from ssad.rendering.camera.effects import DEFAULT_EFFECTS
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, check_effects
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
-from ssad.rendering.camera.render import SceneWeather, View, render
+from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.sensor import SENSOR
@@ -89,6 +89,7 @@ class Recording:
         device: Device that renders (it decides bits, though few: see docs/how-to/record-data.md).
         streets: See `drive_street`.
         randomisation: What is drawn for each camera and each vehicle of a scene.
+        effects: Effects of the rendering, see `ssad.rendering.camera.effects`.
 
     Raises:
         ConfigError: A value is out of range.
@@ -107,8 +108,10 @@ class Recording:
     device: str = "cpu"
     streets: str = "town"
     randomisation: Randomisation = NO_RANDOMISATION
+    effects: frozenset[str] = DEFAULT_EFFECTS
 
     def __post_init__(self) -> None:
+        check_effects(self.effects)
         for town in self.towns:
             if not is_town(town):
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
@@ -129,13 +132,21 @@ class Recording:
             name: list(value) if isinstance(value, tuple) else value
             for name, value in asdict(self).items()
             if name not in ("out", "randomisation")
-        }
+        } | {"effects": sorted(self.effects)}
         # Left out where there is none, so that such recordings keep their identity.
         return settings | ({"randomisation": self.randomisation.identity()} if self.randomisation else {})
 
 
-def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
-    """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads; or all of one kind."""
+def draw_weather(
+    key: tuple[object, ...], kind: str = "", *, effects: Collection[str] = DEFAULT_EFFECTS
+) -> SceneWeather:
+    """Draw the weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads.
+
+    Args:
+        key: Key of the draw.
+        kind: One of `WEATHERS`; "": drawn too.
+        effects: Effects of the rendering. Nights have a class of street lighting if `street-lighting` is among them.
+    """
     rng = generator("record weather", *key)
     drawn_kind = rng.choice(WEATHERS, p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
     heading, turn = float(rng.uniform(-np.pi, np.pi)), float(rng.uniform(0, 50))
@@ -152,16 +163,15 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
             heading,
             float(rng.uniform(0, 0.9)),
             turn=turn,
-            lighting=draw_lighting(generator("record lighting", *key)),
+            lighting=draw_lighting(generator("record lighting", *key)) if "street-lighting" in effects else "",
         ),
     }
     return by_kind[kind or str(drawn_kind)]
 
 
 def draw_lighting(draws: np.random.Generator) -> str:
-    """Draw the class of the street lighting of a night, if the effect `street-lighting` is on; else ""."""
-    lighting = str(draws.choice(list(LIGHTING_SHARES), p=list(LIGHTING_SHARES.values())))
-    return lighting if "street-lighting" in DEFAULT_EFFECTS else ""
+    """Draw the class of the street lighting of a night."""
+    return str(draws.choice(list(LIGHTING_SHARES), p=list(LIGHTING_SHARES.values())))
 
 
 def describe_weather(weather: SceneWeather) -> str:
@@ -248,7 +258,7 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
     population = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
     randomisation = recording.randomisation
     population.bodies = randomisation.randomise_bodies(population.bodies, key)
-    weather = draw_weather(key)
+    weather = draw_weather(key, effects=recording.effects)
     draws = {channel: randomisation.draw_camera((*key, channel)) for channel in RIG}
     cameras = [draws[channel].camera(rig_camera(channel, recording.width)) for channel in RIG]
     samples: list[dict[str, Any]] = []
@@ -269,7 +279,7 @@ def _record_scene(recording: Recording, town: str, number: int) -> None:
             _Moment.of(step, population, heads, trace, (cameras, draws), weather, key)
             for step in steps[start : start + steps_per_call]
         ]
-        for moment, shares in _render_moments(scene, moments, files, number, batched=recording.device != "cpu"):
+        for moment, shares in _render_moments(scene, moments, files, number, recording):
             sweep_end = moment.now
             ego = ego_at(trace, sweep_end)
             surrounding = population.at(sweep_end, ego[:2, 3], RENDER_RANGE)
@@ -371,7 +381,7 @@ class _Moment:
 
 
 def _render_moments(
-    stage: RenderScene, moments: Sequence[_Moment], files: _PartWriter, number: int, *, batched: bool
+    stage: RenderScene, moments: Sequence[_Moment], files: _PartWriter, number: int, recording: Recording
 ) -> Iterator[tuple[_Moment, dict[int, float]]]:
     """Render and write the pictures of some moments, all of them in one call or one by one.
 
@@ -380,10 +390,12 @@ def _render_moments(
     """
     camera_moments = [(moment, camera_index) for moment in moments for camera_index in range(len(moment.views))]
     largest_shares: list[dict[int, float]] = [{} for _ in moments]
-    views_per_call = len(camera_moments) if batched else 1
+    views_per_call = len(camera_moments) if recording.device != "cpu" else 1
+    quality = RenderQuality(effects=recording.effects)
     for start in range(0, len(camera_moments), views_per_call):
         batch = camera_moments[start : start + views_per_call]
-        rendering = render(stage, [moment.views[camera_index] for moment, camera_index in batch], linear=False)
+        views = [moment.views[camera_index] for moment, camera_index in batch]
+        rendering = render(stage, views, quality=quality, linear=False)
         for view_index, (moment, camera_index) in enumerate(batch):
             view = moment.views[camera_index]
             if moment.is_key_frame:
@@ -410,12 +422,12 @@ def moment_timestamp(sweep_number: int, time: float) -> int:
 
 
 def drive_with_autopilot(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
-    """Drive an episode with the Autopilot."""
+    """Drive an episode with the Autopilot; the trace has all traffic lights and turn signals."""
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    return rollout(World([episode], {graph.name: graph}), make_system("autopilot"))[0]
+    return rollout(World([episode], {graph.name: graph}), make_system("autopilot"), all_signals=True)[0]
 
 
 @dataclass(slots=True)

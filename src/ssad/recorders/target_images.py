@@ -55,7 +55,7 @@ from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, PLAIN_CLASSES, class_of
 from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
+from ssad.rendering.camera.render import Rendering, RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.meshes.mesh import Point
@@ -208,7 +208,7 @@ def _viewpoint_rounds(
         yield from _approaching_rounds(stage_set, town, slots, missing, rng)
         return
     if recording.mode == "drive":
-        weather = draw_weather(("clips", *key))
+        weather = draw_weather(("clips", *key), effects=recording.effects)
         remaining = iter(
             following_viewpoints(
                 stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), rng=rng
@@ -230,7 +230,7 @@ def _viewpoint_rounds(
         proposals: list[tuple[int, Viewpoint]] = []
         for index in missing():
             *cell, weather_kind = grid[cell_indices[index]]
-            weather = draw_weather(("clips", *key, turn, index), weather_kind)
+            weather = draw_weather(("clips", *key, turn, index), weather_kind, effects=recording.effects)
             if isinstance(recording.target, TargetSign):
                 seconds = (len(stage_set.trace.x) - 1) * stage_set.trace.dt
                 views = sign_viewpoints(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
@@ -253,7 +253,7 @@ def _approaching_rounds(
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Yield rounds of shots for missing images, each at its own distance, until the drive has no more."""
     recording = stage_set.recording
-    weather = draw_weather(("clips", *stage_set.key))
+    weather = draw_weather(("clips", *stage_set.key), effects=recording.effects)
     distance_indices = shuffled_cells(slots, len(recording.approach), key=(recording.seed, town))
     remaining: dict[int, Iterator[Viewpoint]] = {}
     for index, distance in enumerate(recording.approach):
@@ -360,7 +360,8 @@ def _accept_views(
         candidates.append((slot, viewpoint, view, surrounding))
     batch = batch_size(recording.device)
     for start in range(0, len(candidates), batch):
-        rendering = render(stage_set.scene, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
+        views, quality = [view for _, _, view, _ in candidates[start : start + batch]], recording.render_quality
+        rendering = render(stage_set.scene, views, quality=quality, linear=False)
         for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + batch]):
             objects, reject_reason = _annotate(stage_set.scene, view, rendering, index, surrounding)
             if reject_reason:
@@ -598,6 +599,7 @@ class RecordedView:
         view: Camera, things (the target first, tag `TARGET`) and light.
         objects: What is annotated in it: label (index into `CLASSES`), bbox (x, y, width, height) of what is seen, hull
             (the same of the whole 3D box), area, target ...
+        quality: Quality with which it was rendered.
     """
 
     file: str
@@ -605,6 +607,7 @@ class RecordedView:
     scene: RenderScene
     view: View
     objects: tuple[Mapping[str, Any], ...]
+    quality: RenderQuality
 
     def with_layers(self, *edits: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
@@ -665,7 +668,8 @@ def recorded_views(
 ) -> Iterator[RecordedView]:
     """The pictures of a recording with their scenes, in order.
 
-    Rendering a view gives the recorded picture (before JPEG) again. Pictures of one drive share a scene.
+    Rendering a view with its quality gives the recorded picture (before JPEG) again. Pictures of one drive share a
+    scene.
 
     Args:
         folder: What `record_target_images` wrote.
@@ -701,7 +705,7 @@ def recorded_views(
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
             surrounding = _surrounding(stage_set, viewpoint)
             view = _view(stage_set, row["slot"], viewpoint, surrounding, _draw_camera(stage_set, row["slot"]))
-            yield RecordedView(row["file_name"], row, stage_set.scene, view, objects)
+            yield RecordedView(row["file_name"], row, stage_set.scene, view, objects, recording.render_quality)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
@@ -719,6 +723,7 @@ def _recording_from_description(description: Mapping[str, Any], folder: Path, de
         if name != "clips"
     }
     settings["randomisation"] = Randomisation.of(settings.get("randomisation", {}))
+    settings["effects"] = frozenset(description["effects"])
     settings["images"] = tuple((town, count) for town, count in description["images"])
     if description["target"] is not None:
         size = description["target"]["size"]

@@ -15,6 +15,8 @@ from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
 from ssad.recorders.parts import PartsFolder
 from ssad.recorders.randomisation import NO_RANDOMISATION, Randomisation
+from ssad.rendering.camera.effects import DEFAULT_EFFECTS, check_effects
+from ssad.rendering.camera.render import RenderQuality
 from ssad.rendering.target import Target, TargetSign, TargetWalker
 from ssad.world.roads import is_town
 
@@ -50,6 +52,7 @@ class TargetRecording:
         weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
         randomisation: What is drawn for each image and for each vehicle of a drive.
         approach: Distances of the following camera in place of `behind`, m of way, in turn; empty: `behind` alone.
+        effects: Effects of the rendering, see `ssad.rendering.camera.effects`.
 
     Raises:
         ConfigError: A value is out of range, or the values do not fit together.
@@ -73,8 +76,10 @@ class TargetRecording:
     weathers: tuple[str, ...] = ()
     randomisation: Randomisation = NO_RANDOMISATION
     approach: tuple[float, ...] = ()
+    effects: frozenset[str] = DEFAULT_EFFECTS
 
     def __post_init__(self) -> None:
+        check_effects(self.effects)
         for town in (*(name for name, _ in self.images), *self.held_out):
             if not is_town(town):
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
@@ -133,12 +138,18 @@ class TargetRecording:
         """The parts of the recording."""
         return PartsFolder(self.out, self.identity())
 
+    @property
+    def render_quality(self) -> RenderQuality:
+        """Quality of the rendering: everything, with the effects of the recording."""
+        return RenderQuality(effects=self.effects)
+
     def identity(self) -> dict[str, Any]:
         """Return the settings that decide the bytes of the recording, as plain data."""
         settings = asdict(replace(self, out=Path())) | {
             "clips": self.mode,
             "images": [list(pair) for pair in self.images],
             "randomisation": self.randomisation.identity(),
+            "effects": sorted(self.effects),
         }
         # Empty values are left out, so that recordings without them keep their identity.
         optional = ("weathers", "randomisation", "approach")

@@ -142,12 +142,20 @@ class EpisodeScene:
     def __init__(self, graph: LaneGraph, *, device: str = "cpu") -> None:
         self.graph, self.device = graph, device
         street = self.street = cached_street(graph)
-        sign_positions = graph.sign_xy.astype(np.float64).reshape(-1, 2)
         signs = list(
-            street_signs(graph, sign_positions, GroundOccupancy(street), key=(graph.name,), many=False, detail=1)
+            street_signs(
+                graph,
+                np.concatenate([graph.sign_xy, street.limit_signs[:, :2]]).astype(np.float64),
+                GroundOccupancy(street),
+                key=(graph.name,),
+                many=False,
+                detail=1,
+                limit_signs=street.limit_signs,
+            )
         )
         self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
         self.sign_kinds = {index: sign.kind for index, sign in enumerate(signs)}
+        self.sign_styles = {index: sign.style for index, sign in enumerate(signs)}
         self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
         # Signs and lenses come first: their numbers must not change when bodies are added.
         self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + list(head_meshes())

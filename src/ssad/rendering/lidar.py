@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.boxes import WorldBoxes
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
@@ -24,7 +25,6 @@ from ssad.rendering.camera.scene import RenderScene, SceneObject
 
 GLASS = 0.3  # share of beams that a pane of glass returns
 FALL = 50.0  # range at which the intensity is halved, m
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 ON_ROOF: F64 = np.array([[0.0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 0, 0, 1]])
 

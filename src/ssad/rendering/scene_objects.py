@@ -15,7 +15,7 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import F64, U8, Bool, EpisodeTrace, LaneType
+from ssad.core.types import F32, F64, U8, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, TowingVehicle, plain_body, towing_vehicle
 from ssad.rendering.camera.scene import Finish, SceneObject
@@ -366,7 +366,7 @@ def place_objects(
     )
     _add_sidewalk_bodies(population, graph, route_points, free_ground, len(trace.x))
     # Signs come last: they evade whatever stands at their place, and nothing evades them.
-    _add_signs(population, graph, route_points, free_ground, many=many_signs)
+    _add_signs(population, graph, route_points, free_ground, many=many_signs, limit_signs=street.limit_signs)
     return population
 
 
@@ -692,11 +692,25 @@ def occupy_standing(population: SceneObjects, occupancy: GroundOccupancy) -> Non
 
 
 def _add_signs(
-    population: SceneObjects, graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, many: bool
+    population: SceneObjects,
+    graph: LaneGraph,
+    route_points: F64,
+    occupancy: GroundOccupancy,
+    *,
+    many: bool,
+    limit_signs: F32 | None = None,
 ) -> None:
-    """Stop and yield signs: the plate is the body with a kind, the post one without."""
+    """Stop, yield and speed-limit signs: the plate is the body with a kind, the post one without."""
     occupy_standing(population, occupancy)
-    for sign in street_signs(graph, route_points, occupancy, key=population.key, many=many, detail=population.detail):
+    for sign in street_signs(
+        graph,
+        route_points,
+        occupancy,
+        key=population.key,
+        many=many,
+        detail=population.detail,
+        limit_signs=limit_signs,
+    ):
         for kind, mesh in ((sign.kind, sign.plate), ("", sign.post)):
             population.add((kind, sign.style, sign.size, (population.meshes.add(mesh),)), _fixed_track(*sign.pose))
 

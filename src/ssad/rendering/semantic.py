@@ -123,7 +123,8 @@ class OnboardSemanticCamera:
 
     def _read(self, sight: AgentView, kinds: Sequence[int] | I32) -> U8:
         scene = sight.town.scene
-        rendering = render(scene, [self.onboard.view(sight, self.camera)], linear=False, materials=True)
+        view, quality = self.onboard.view(sight, self.camera), self.onboard.quality
+        rendering = render(scene, [view], quality=quality, linear=False, materials=True)
         assert rendering.material is not None
         by_material = [CLASS_OF_MATERIAL.get(name, SemanticClass.STATIC) for name in scene.material_names]
         # The last entry is that of row -1, the sky.

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, EpisodeTrace, SignalState
-from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.camera.scene import SceneObject
@@ -45,7 +45,7 @@ def lens_emission(state: SignalState) -> float:
     """
     luminance = LENS_CANDELA / (np.pi * LENS**2)
     # A white surface has the luminance of its illuminance over pi.
-    return float(luminance * np.pi * per_lux(SceneWeather(1.0)) / np.dot(LIGHTS[state], TO_LUMINANCE))
+    return float(luminance * np.pi * per_lux(SceneWeather(1.0)) / np.dot(LIGHTS[state], LUMINANCE))
 
 
 def _disc(radius: float, depth: tuple[float, float], material: Material) -> Mesh:

@@ -1,4 +1,4 @@
-"""Stop and yield signs of recorded drives: their places, and their bodies in two parts, plate and post."""
+"""Stop, yield and speed-limit signs: their places, and their bodies in two parts, plate and post."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.seeding import generator
-from ssad.core.types import F64, LaneType
+from ssad.core.types import F32, F64, LaneType
 from ssad.rendering.bodies import draw_size, draw_style, make_body
 from ssad.rendering.meshes.mesh import Mesh, Point, part_of
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ssad.rendering.scene_objects import GroundOccupancy
 
 KINDS: Final = {SignKind.STOP: "stop_sign", SignKind.YIELD: "yield_sign"}
+LIMIT_SIGN: Final = "limit_sign"
 KERB: Final = 0.12  # m, height of sidewalks
 REACH: Final = 120.0  # m from the way of the ego within which signs stand
 ROOM: Final = 0.5  # m, side of the square that a post takes
@@ -32,8 +33,8 @@ class StreetSign:
     """Sign of a drive.
 
     Attributes:
-        kind: Kind of its body: stop_sign or yield_sign.
-        style: Style of its body.
+        kind: Kind of its body: stop_sign, yield_sign or limit_sign.
+        style: Style of its body; of a speed-limit sign, its figures.
         size: Length, width, height, m.
         pose: x, y, yaw (of the direction that it faces) and z of its foot.
         plate: Mesh of the labelled plate.
@@ -49,7 +50,14 @@ class StreetSign:
 
 
 def street_signs(
-    graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, key: tuple[object, ...], many: bool, detail: int
+    graph: LaneGraph,
+    route_points: F64,
+    occupancy: GroundOccupancy,
+    *,
+    key: tuple[object, ...],
+    many: bool,
+    detail: int,
+    limit_signs: F32 | None = None,
 ) -> Iterator[StreetSign]:
     """The signs near a way.
 
@@ -60,12 +68,16 @@ def street_signs(
         key: Of what is drawn.
         many: Whether further signs stand along the kerbs, as at crosswalks and driveways.
         detail: Of the meshes, see `make_body`.
+        limit_signs: Speed-limit signs of the street [L, 5], see `ssad.rendering.street.model.Street`; None: none.
 
     Yields:
         One sign after another.
     """
     map_signs = list(_map_signs(graph))
     candidates = [*map_signs, *(_along_kerbs(graph, route_points, key) if many else ())]
+    # Speed-limit signs come last: they change none of the others.
+    figures = {len(candidates) + row: str(round(limit)) for row, limit in enumerate(_limits(limit_signs)[:, 4])}
+    candidates += [(LIMIT_SIGN, x, y, yaw, z) for x, y, yaw, z, _ in _limits(limit_signs).tolist()]
     for index, (kind, x, y, yaw, z) in enumerate(candidates):
         if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > REACH:
             continue
@@ -74,7 +86,7 @@ def street_signs(
             continue
         # A generator per place: a sign that has no room changes none of the others.
         rng = generator("street sign", *key, index)
-        style = draw_style(kind, generator=rng)
+        style = figures[index] if index in figures else draw_style(kind, generator=rng)
         if style == "all_way" and index < len(map_signs):
             style = "standard"  # the main road of a T-junction does not stop
         size = draw_size(kind, style, generator=rng)
@@ -106,6 +118,10 @@ def _map_signs(graph: LaneGraph) -> Iterator[tuple[str, float, float, float, flo
     for sign_index, (x, y) in enumerate(graph.sign_xy.astype(float).tolist()):
         z = KERB if sign_index in lane_of and _sidewalk(graph, lane_of[sign_index]) else 0.0
         yield KINDS[SignKind(int(graph.sign_kind[sign_index]))], x, y, float(graph.sign_yaw[sign_index]), z
+
+
+def _limits(limit_signs: F32 | None) -> F64:
+    return np.zeros((0, 5)) if limit_signs is None else limit_signs.astype(np.float64)
 
 
 def _sidewalk(graph: LaneGraph, lane: int) -> bool:

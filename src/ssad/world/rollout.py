@@ -390,6 +390,7 @@ def rollout(
     sensors: Mapping[str, Sensor] | None = None,
     perturbation: Changes | None = None,
     policies: Policies | None = None,
+    all_signals: bool = False,
 ) -> list[EpisodeTrace]:
     """Drive all scenes of a simulator from their starts to their ends.
 
@@ -399,6 +400,8 @@ def rollout(
         sensors: Sensors that drivers may request besides `ssad.world.sensors.SENSORS`.
         perturbation: Changes between sensors, drivers and vehicles, as `Loop` takes them.
         policies: Makes the drivers that episodes name, such as `ssad.drivers.make_system`.
+        all_signals: Record the traffic lights of the whole town, and the turn signals of all agents. By default a trace
+            has the traffic lights on the ego's route, and turn signals only where a driver of the population drives.
 
     Returns:
         A trace of each scene.
@@ -411,7 +414,7 @@ def rollout(
     loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation, policies=policies)
     loop.reset()
     # Traces of episodes without drivers of the population are those of earlier versions, to the byte.
-    shows_signals = any(map(has_drivers, simulator.episodes))
+    shows_signals = all_signals or any(map(has_drivers, simulator.episodes))
     rows = [_row(simulator.state(), turn_signals=shows_signals)]
     lengths = np.zeros(simulator.batch, np.int64)
     for step in range(1, step_limit(simulator) + 1):
@@ -423,7 +426,10 @@ def rollout(
         if (simulator.ended() != End.RUNNING).all():
             break
     recording = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return [_trace(simulator, recording, scene, int(lengths[scene]) + 1) for scene in range(simulator.batch)]
+    return [
+        _trace(simulator, recording, scene, int(lengths[scene]) + 1, all_signals=all_signals)
+        for scene in range(simulator.batch)
+    ]
 
 
 def route_signals(graph: LaneGraph, route: Route) -> I32:
@@ -463,19 +469,23 @@ def _row(state: WorldState, *, turn_signals: bool) -> dict[str, npt.NDArray[np.g
     }
 
 
-def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: int, steps: int) -> EpisodeTrace:
+def _trace(
+    simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: int, steps: int, *, all_signals: bool
+) -> EpisodeTrace:
     """Of scene b, from the steps of all scenes [T, B, ...]."""
     episode = simulator.episodes[simulator.assigned[b]]
     graph = simulator.graphs[episode.town]
     state = simulator.state()
     agent_count = int((state.kind[b] != AgentKind.NONE).sum())
-    agent_names = (*_AGENT, "turn_signal") if has_drivers(episode) else _AGENT
+    agent_names = (*_AGENT, "turn_signal") if all_signals or has_drivers(episode) else _AGENT
     agent_fields: dict[str, Any] = {name: rows[name][:steps, b, :agent_count].copy() for name in agent_names}
     ego_names = set(rows) - {*_AGENT, "turn_signal"}
     ego_fields: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name in ego_names}
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
     signal_ids = route_signals(graph, route)
+    if all_signals:
+        signal_ids = np.arange(len(graph.signal_junction), dtype=np.int32)
     ego_fields["signal"] = ego_fields["signal"][:, signal_ids]
     return EpisodeTrace(
         key=episode.key,

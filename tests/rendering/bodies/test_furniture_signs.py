@@ -1,16 +1,21 @@
-"""Stop and yield signs: plates of the size of the US on posts, with a face that takes textures."""
+"""Stop, yield and speed-limit signs: plates on posts, with a face that takes textures."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import BODIES, draw_size, make_body
+from ssad.rendering.bodies.figures import number_strokes
 from ssad.rendering.meshes.mesh import Mesh
 
 KINDS = ("stop_sign", "yield_sign")
-STYLES = [(kind, style) for kind in KINDS for style in BODIES[kind].styles]
+STYLES = [(kind, style) for kind in KINDS for style in BODIES[kind].styles] + [
+    ("limit_sign", "30"),
+    ("limit_sign", "120"),
+]
 
 
 def area_of(mesh: Mesh, material: str, panel: str = "face") -> float:
@@ -29,7 +34,7 @@ def test_the_plate_is_at_the_top_and_looks_ahead(kind: str, style: str) -> None:
         for panel, way in (("face", 1.0), ("back", -1.0)):
             corners = mesh.corners()[mesh.panel == mesh.panels.index(panel)]
             low, high = corners.reshape(-1, 3).min(0), corners.reshape(-1, 3).max(0)
-            assert 0.6 < high[1] - low[1] < 1.0
+            assert 0.55 < high[1] - low[1] < 1.0
             assert high[1] - low[1] == pytest.approx(size[1], abs=1e-4)
             assert high[2] == pytest.approx(size[2], abs=1e-4)
             assert 1.8 < low[2] < 2.4
@@ -87,3 +92,38 @@ def test_signs_of_a_seed_are_the_same_and_others_differ() -> None:
     assert np.array_equal(first.vertices, again.vertices)
     assert first.materials == again.materials
     assert other.materials != first.materials
+
+
+@pytest.mark.parametrize("style", ["30", "80", "120"])
+def test_a_limit_sign_is_a_white_disc_in_a_red_ring_with_its_figures(style: str) -> None:
+    mesh = make_body("limit_sign", style=style, generator=generator("limit", style))
+    low, high = mesh.bounds()
+    disc = np.pi * (0.5 * (high[1] - low[1])) ** 2
+    assert area_of(mesh, "sign_red") == pytest.approx(disc, rel=0.01)
+    assert area_of(mesh, "sign_white") == pytest.approx(0.76**2 * disc, rel=0.01)
+    assert 0.08 * disc < area_of(mesh, "sign_ink") < 0.25 * disc
+    face = mesh.panel == mesh.panels.index("face")
+    ink = mesh.corners()[face & (mesh.material == [m.name for m in mesh.materials].index("sign_ink"))]
+    reach = np.hypot(ink[..., 1], ink[..., 2] - (high[2] - 0.5 * (high[1] - low[1])))
+    assert reach.max() < 0.76 * 0.5 * (high[1] - low[1]), "the figures stay on the white disc"
+
+
+def test_numbers_read_from_left_to_right() -> None:
+    """A one is narrow and stands to the left of the reader in 10, to the right in 01."""
+    first, last = (np.concatenate(number_strokes(text, segments=6)) for text in ("10", "01"))
+    assert np.median(first[:, 0]) > 0.1
+    assert np.median(last[:, 0]) < -0.1
+    assert first[:, 1].max() == pytest.approx(-first[:, 1].min(), abs=0.1)
+
+
+def test_every_number_has_its_shape() -> None:
+    """Drawn as masks, no two figures cover each other by more than 95 %."""
+    masks = {}
+    for figure in "0123456789":
+        mask = np.zeros((100, 100), np.uint8)
+        for stroke in number_strokes(figure, segments=8):
+            cv2.fillPoly(mask, [np.round(50 + 45 * stroke * [1, -1]).astype(np.int32)], 1)
+        masks[figure] = mask > 0
+    for figure, mask in masks.items():
+        for other in masks.keys() - {figure}:
+            assert (mask & masks[other]).sum() < 0.95 * (mask | masks[other]).sum(), f"{figure} and {other}"

@@ -11,11 +11,15 @@ import torch
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
+from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
 from ssad.rendering.camera.effects import ALL_EFFECTS, DEFAULT_EFFECTS, EFFECTS, NO_EFFECTS, select_effects
 from ssad.rendering.camera.kernels.sky import MOLECULES
+from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import PLAIN, VISUAL_RANGE, RenderQuality, SceneWeather, View, render, scene_light
-from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
-from ssad.rendering.camera.texture import retexture, texture_taps
+from ssad.rendering.camera.scene import LampSignal, RenderScene, SceneObject, TextureLayer
+from ssad.rendering.camera.sensor import SensorModel
+from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 from ssad.rendering.street import cached_street
@@ -187,18 +191,56 @@ def test_textures_stay_linear_under_all_effects(scene: RenderScene) -> None:
     assert np.median(difference) < 1e-5
 
 
+@pytest.mark.parametrize("weather", [replace(NOON, wet=0.8), NIGHT], ids=["wet day", "night"])
+def test_a_texture_of_one_colour_is_a_paint_in_a_street(weather: SceneWeather) -> None:
+    """Under all effects, also where head lamps shine on the lamps of the car that wears it."""
+    pose = np.eye(4)
+    pose[:2, 3] = cached_street("Twinford").lamps[0, :2] + [0.0, 3.0]
+    body, colour = make_body("car", style="sedan", generator=generator("effects")), (0.7, 0.2, 0.4)
+    scene = RenderScene(cached_street("Twinford"), [body])
+
+    def seen(paint: tuple[float, float, float], *layers: TextureLayer) -> View:
+        car = SceneObject(0, pose @ place(8.0, 0.3), paint, 1, layers, signals=LampSignal.BRAKE)
+        return View(CAMERA, pose @ place(0.0, 0.0) @ FORWARD, (car,), weather, lamps=own_lamps(pose, weather))
+
+    painted = render(scene, [seen(colour)], quality=only("all"))
+    textured = render(scene, [seen((0.5, 0.5, 0.5), TextureLayer(0))], quality=only("all"))
+    taps = texture_taps(textured, 16, mask=paint_mask(body, (16, 16)))
+    texture = torch.tensor(colour)[:, None, None].expand(3, 16, 16)
+    out = retexture(taps, texture, torch.tensor(textured.radiance)).numpy()
+    is_body = painted.tag == 1
+    assert is_body.sum() > 100
+    assert out[is_body] == pytest.approx(painted.radiance[is_body], rel=1e-4, abs=1e-4)
+    # Wet roads mirror a grey in place of the texture.
+    assert np.abs(out - painted.radiance).max() < 0.02
+
+
+def test_views_of_one_scene_do_not_share_what_they_mirror(scene: RenderScene) -> None:
+    """In a scene without a street each place of a camera has a probe of its own, though the objects are the same."""
+    near = view(SceneObject(CUBE, place(7.0, 0.4), (0.5, 0.5, 0.5), 1), SceneObject(RED_WALL, place(7.0, 20.0)))
+    far = replace(near, pose=place(-3.0, 2.0) @ FORWARD)
+    together = render(scene, [near, far], quality=only("all"))
+    for index, alone in enumerate((near, far)):
+        assert (render(scene, [alone], quality=only("all")).radiance[0] == together.radiance[index]).all()
+
+
 def test_a_picture_of_a_street_depends_on_its_view_alone() -> None:
-    """Views in one square share a probe, in whatever order they are rendered."""
+    """Views in one square share a probe, in whatever order they are rendered, by day, by night and on wet roads."""
     street = cached_street("Twinford")
     x, y = street.lamps[0, :2] + np.array([0.0, 3.0])
+    day, night = SceneWeather(0.6, 0.7, 0.2), SceneWeather(-0.3, clouds=0.9, wet=0.8)
     views = []
-    for shift, heading in ((0.0, 0.7), (2.0, 0.7), (30.0, 2.1)):
+    for shift, weather in ((0.0, day), (2.0, day), (30.0, replace(day, wet=0.9)), (2.0, night), (2.0, NIGHT)):
         pose = FORWARD.copy()
         pose[:3, 3] = x + shift, y, 1.5
-        views.append(View(CAMERA, pose, weather=SceneWeather(0.6, heading, 0.2)))
-    effects = only("reflections", "wet-reflections", "soft-shadows", "haze")
-    together = render(RenderScene(street, []), views, quality=effects).radiance
-    other = RenderScene(street, [])
-    for index in (2, 1, 0, 2):
-        assert (render(other, [views[index]], quality=effects).radiance[0] == together[index]).all()
-    assert (render(other, views, quality=only()).radiance != together).any((1, 2, 3)).all()
+        car = SceneObject(0, pose @ place(9.0, 0.5, -1.5), (0.6, 0.1, 0.2), 1, signals=LampSignal.BRAKE)
+        own = own_lamps(pose @ place(2.0, 0.0, -1.5), weather)
+        views.append(View(CAMERA, pose, (car,), weather, SensorModel(noise=0.012), len(views), own))
+    body = make_body("car", style="sedan", generator=generator("effects"))
+    together = render(RenderScene(street, [body]), views, quality=only("all"))
+    other = RenderScene(street, [body])
+    for index in (4, 2, 0, 3):
+        alone = render(other, [views[index]], quality=only("all"))
+        assert (alone.radiance[0] == together.radiance[index]).all()
+        assert (alone.image[0] == together.image[index]).all()
+    assert (render(other, views, quality=only()).radiance != together.radiance).any((1, 2, 3)).all()

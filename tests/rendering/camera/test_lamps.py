@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.effects import NO_EFFECTS, select_effects
+from ssad.rendering.camera.effects import ALL_EFFECTS, NO_EFFECTS, select_effects
 from ssad.rendering.camera.lamps import (
     BRAKE_RATIO,
     NIGHT_LUX,
-    TO_LUMINANCE,
     SceneLamp,
     lamp_strength,
     lit_circle,
@@ -197,9 +197,9 @@ def test_bodies_keep_the_sky_from_the_ground(scene: RenderScene) -> None:
 
 
 def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
-    """Radiance is gain times albedo where nothing mirrors; positions lie on the ground; normals point up."""
+    """Radiance is gain times albedo where nothing mirrors or fades; positions lie on the ground; normals point up."""
     view = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)),), SceneWeather())
-    picture = render(scene, [view], surface=True)
+    picture = render(scene, [view], quality=RenderQuality(effects=ALL_EFFECTS - {"haze"}), surface=True)
     surface = picture.surface
     assert surface is not None
     solid = picture.tag[0] == 0
@@ -287,7 +287,7 @@ def test_a_low_beam_meets_the_limits_of_its_regulation(scene: RenderScene) -> No
     lit, dark = (render(scene, [v], surface=True).surface for v in (view, replace(view, lamps=())))
     assert lit is not None
     assert dark is not None
-    lux = (lit.irradiance[0].astype(float) - dark.irradiance[0]) @ TO_LUMINANCE / NIGHT_LUX
+    lux = (lit.irradiance[0].astype(float) - dark.irradiance[0]) @ LUMINANCE / NIGHT_LUX
     distance = np.linalg.norm(lit.position[0], axis=-1)
     candela = 0.5 * lux * distance**3 / 25.0
     for name, (right, up, least, most) in BEAM_LIMITS.items():
@@ -350,7 +350,7 @@ def test_stop_lamps_and_indicators_shine(scene: RenderScene, weather: SceneWeath
     assert right[:, 64:].sum() == pytest.approx(left[:, :64].sum(), rel=0.2)
     assert not right[:, :64].any()
     assert 0.15 < left[..., 1].sum() / left[..., 0].sum() < 0.5, "amber"
-    assert not gained(LampSignal.BRAKE, RenderQuality()).any(), "the effect is off"
+    assert not gained(LampSignal.BRAKE, RenderQuality(effects=NO_EFFECTS)).any(), "the effect is off"
 
 
 def test_stop_lamps_light_the_road_behind(scene: RenderScene) -> None:

@@ -21,7 +21,9 @@ from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera import torch_jpeg
-from ssad.rendering.camera.render import SceneWeather, View, develop_radiance, render, response
+from ssad.rendering.camera.effects import NO_EFFECTS
+from ssad.rendering.camera.glare import with_lens_effects
+from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, develop_radiance, render, response
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
 from ssad.rendering.camera.sensor import DAY_EXPOSURE, PINHOLE, SensorModel, noise_levels
 from ssad.rendering.camera.texture import Taps, retexture, texture_taps
@@ -95,7 +97,8 @@ def test_torch_develops_what_the_renderer_does(stage: RenderScene) -> None:
     views = [replace(look(), sensor=sensor) for sensor in SENSORS.values()]
     picture = render(stage, views)
     for k, (name, sensor) in enumerate(SENSORS.items()):
-        shown = develop(torch.tensor(picture.radiance[k : k + 1]), float(picture.exposure[k]), sensor)
+        lens = with_lens_effects(sensor, picture.effects)
+        shown = develop(torch.tensor(picture.radiance[k : k + 1]), float(picture.exposure[k]), lens)
         apart = (shown[0].permute(1, 2, 0) * 255).round().numpy() - picture.image[k]
         assert np.abs(apart).max() <= 1, name
         assert np.abs(apart).mean() < 0.1, name
@@ -512,4 +515,5 @@ def test_wrong_use_is_refused_in_one_line(stage: RenderScene) -> None:
         with pytest.raises(ConfigError) as error:
             call()
         assert "\n" not in str(error.value)
-    assert render(stage, [replace(small, sensor=PINHOLE)]).image.shape == (1, 3, 3, 3)
+    pinhole = render(stage, [replace(small, sensor=PINHOLE)], quality=RenderQuality(effects=NO_EFFECTS))
+    assert pinhole.image.shape == (1, 3, 3, 3)

@@ -8,10 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import UnknownNameError
 from ssad.core.frames import Camera
 from ssad.rendering.camera.effects import NO_EFFECTS, select_effects
-from ssad.rendering.camera.lamps import NIGHT_LUX, TO_LUMINANCE
+from ssad.rendering.camera.lamps import NIGHT_LUX
 from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, render, scene_light
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.street_lighting import (
@@ -57,7 +58,7 @@ def illuminance(lighting: str, *, effects: frozenset[str] = NO_EFFECTS) -> tuple
     is_road = np.char.startswith(np.array(town().material_names)[found.material], "asphalt")
     (_, _, zenith, horizon, *_), _ = scene_light(views[0].weather)
     sky = 0.65 * np.array(zenith) + 0.35 * np.array(horizon)
-    lux = (found.surface.irradiance[is_road] - sky) @ TO_LUMINANCE / NIGHT_LUX
+    lux = (found.surface.irradiance[is_road] - sky) @ LUMINANCE / NIGHT_LUX
     return float(lux.mean()), float(np.quantile(lux, 0.01))
 
 
@@ -86,7 +87,7 @@ def test_an_unlit_night_has_one_lux(clouds: float) -> None:
     assert found.surface is not None
     assert found.material is not None
     names = np.array(town().material_names)[found.material]
-    lux = found.surface.irradiance @ TO_LUMINANCE / NIGHT_LUX
+    lux = found.surface.irradiance @ LUMINANCE / NIGHT_LUX
     is_level_road = np.char.startswith(names, "asphalt") & (found.surface.normal[..., 2] > 0.9999)
     assert is_level_road.sum() > 1000
     assert lux[is_level_road] == pytest.approx(1.0, rel=1e-3)

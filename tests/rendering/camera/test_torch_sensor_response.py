@@ -9,8 +9,10 @@ import torch
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
+from ssad.rendering.camera.sensor import DEFAULT_SENSOR
 from ssad.rendering.camera.texture import retexture, texture_taps, to_linear
 from ssad.rendering.camera.torch_sensor import develop
 from ssad.rendering.meshes.mesh import Material, build
@@ -46,11 +48,12 @@ def picture(stage: RenderScene) -> Rendering:
 
 def test_the_developed_picture_is_that_of_the_renderer(stage: RenderScene, picture: Rendering) -> None:
     painted = render(stage, [view()])
-    shown = develop(torch.tensor(painted.radiance), torch.tensor(painted.exposure)) * 255
+    lens = with_lens_effects(DEFAULT_SENSOR, painted.effects)
+    shown = develop(torch.tensor(painted.radiance), torch.tensor(painted.exposure), lens) * 255
     assert (shown[0].permute(1, 2, 0).numpy() - painted.image[0]).__abs__().max() < 1.2
     colour = torch.tensor([0.6, 0.1, 0.2])[:, None, None].expand(3, 32, 32)
     worn = retexture(texture_taps(picture, 32), colour, torch.tensor(picture.radiance))
-    again = develop(worn, torch.tensor(picture.exposure)) * 255
+    again = develop(worn, torch.tensor(picture.exposure), lens) * 255
     assert (again[0].permute(1, 2, 0).numpy() - painted.image[0]).__abs__().max() < 1.5
 
 

@@ -35,7 +35,7 @@ class BodyStyle:
 class BodyKind:
     """Maker and styles of a kind of body.
 
-    `phased` bodies move with a phase (rad); `driven` ones show their driver.
+    `phased` bodies move with a phase (rad); `driven` ones show who sits in them.
     """
 
     make: Callable[..., Mesh]
@@ -72,6 +72,7 @@ BODIES: dict[str, BodyKind] = {
             "tractor": BodyStyle((6.2, 2.60, 3.60), 0.05, 1.0),
             "tipper": BodyStyle((7.6, 2.55, 3.15), 0.06, 1.0),
         },
+        driven=True,
     ),
     "bus": BodyKind(
         heavy.bus,
@@ -80,6 +81,7 @@ BODIES: dict[str, BodyKind] = {
             "coach": BodyStyle((12.1, 2.94, 3.60), 0.04, 1.0),
             "bendy": BodyStyle((17.8, 2.94, 3.35), 0.02, 0.5),
         },
+        driven=True,
     ),
     "trailer": BodyKind(
         heavy.trailer,
@@ -190,6 +192,11 @@ BODIES: dict[str, BodyKind] = {
             "standard": BodyStyle((0.08, 0.90, 2.90), 0.03, 3.0),
             "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
         },
+    ),
+    "limit_sign": BodyKind(
+        furniture.limit_sign,
+        # 600 mm in towns, 750 mm on faster roads
+        {str(limit): BodyStyle((0.08, 0.60 if limit < 70 else 0.75, 2.80), 0.02) for limit in range(10, 150, 10)},
     ),
     "debris": BodyKind(
         anomalies.debris,
@@ -326,7 +333,7 @@ def make_body(
         generator: Source of randomness.
         detail: 2 is full, 0 is for far away; draws and size do not depend on it.
         phase: Place in the cycle of a walker, or angle of a bicycle's crank, rad.
-        has_driver: Whether somebody sits in a car; draws do not depend on it.
+        has_driver: Whether somebody sits in a car, truck or bus; draws do not depend on it.
 
     Returns:
         The mesh.

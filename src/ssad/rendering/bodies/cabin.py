@@ -47,7 +47,7 @@ class DriverColours:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pane:
+class Pane:
     """Pane ahead or behind: its lower and upper edge, and half its width at both, m."""
 
     low: float
@@ -56,9 +56,11 @@ class _Pane:
     high_width: float
 
     def up(self, share: float) -> float:
+        """Return the height at a share of the way from the lower to the upper edge, m."""
         return self.low + share * (self.high - self.low)
 
     def half_width(self, share: float) -> float:
+        """Return half the width there, m."""
         return self.low_width + share * (self.high_width - self.low_width)
 
     def band(self, low: float, high: float, width: float) -> list[Outline]:
@@ -86,19 +88,20 @@ def cabin(shell: Shell, size: Point, body: Mesh, *, detail: int, driver: DriverC
     ]
 
 
-def _pane(surface: Surface) -> _Pane | None:
+def pane_of(surface: Surface) -> Pane | None:
+    """Return the bounds of the panes of a surface ahead or behind; None without one."""
     pane_points = surface.corners.reshape(-1, 3)
     if not len(pane_points):
         return None
     heights, half_widths = pane_points[:, 2], np.abs(pane_points[:, 1])
     low, high = float(heights.min()), float(heights.max())
     is_low, is_high = heights < low + 0.2 * (high - low), heights > high - 0.2 * (high - low)
-    return _Pane(low, high, float(half_widths[is_low].max()), float(half_widths[is_high].max()))
+    return Pane(low, high, float(half_widths[is_low].max()), float(half_widths[is_high].max()))
 
 
 def _behind(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
     """Rear window: headrests before the light of the windscreen."""
-    window_pane = _pane(surface)
+    window_pane = pane_of(surface)
     if window_pane is None:
         return []
     corner_count = 8 if detail == 2 else 6
@@ -126,7 +129,7 @@ def _behind(surface: Surface, detail: int, driver: DriverColours | None) -> list
 
 def _ahead(surface: Surface, detail: int, driver: DriverColours | None) -> list[Mesh]:
     """Windscreen: dashboard, seats and steering wheel before the light of the rear window."""
-    window_pane = _pane(surface)
+    window_pane = pane_of(surface)
     if window_pane is None:
         return []
     corner_count = 8 if detail == 2 else 6
@@ -176,7 +179,7 @@ def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: Dri
     head_outlines: list[Outline] = []
     torso_outlines: list[Outline] = []
     for index, (start, end) in enumerate(shell.windows):
-        edges = _window_edges(shell, size, start, end)
+        edges = window_edges(shell, size, start, end)
         if edges is None:
             continue
         front, rear = edges  # lower and upper point (x, z) of both edges
@@ -218,7 +221,7 @@ def _sides(shell: Shell, size: Point, surface: Surface, detail: int, driver: Dri
     return patches(surface, draped_pieces)
 
 
-def _window_edges(shell: Shell, size: Point, start: float, end: float) -> tuple[F64, F64] | None:
+def window_edges(shell: Shell, size: Point, start: float, end: float) -> tuple[F64, F64] | None:
     """Return lower and upper end (x, z) of the front and the rear edge of a side window [2, 2], m; None without one."""
     half_sections = sections(shell, size, np.array([start, end]), detail=2)
     edges = half_sections[:, [U1, U2]][..., [0, 2]]

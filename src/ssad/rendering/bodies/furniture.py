@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ssad.rendering.bodies.figures import number_strokes
 from ssad.rendering.bodies.parts import (
     STEEL,
     TRIM,
@@ -21,6 +22,7 @@ from ssad.rendering.bodies.parts import (
 )
 from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, build, lathe, merge, prism, triangulate, tube
 
+WORN_LIMITS = 0.2  # share of speed-limit signs whose sheeting has faded
 ORANGE = Material("orange", (0.75, 0.12, 0.01), specular=0.04, gloss=0.3)
 WHITE = Material("reflective", (0.78, 0.78, 0.78), specular=0.1, gloss=0.6)
 RED = Material("red", (0.52, 0.015, 0.02), specular=0.06, gloss=0.5)
@@ -428,6 +430,28 @@ def yield_sign(style: str, size: Point, *, generator: np.random.Generator, detai
     parts = [_post(style, height - 0.3 * width, generator)]
     parts += _plate(layers, np.array([0.0, height - 0.5 * triangle_height]), detail)
     return finish(parts, _square_charts(half_width, height), size)
+
+
+def limit_sign(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """Return a speed-limit sign (C 14 of the Vienna convention) on a post, with the panels of `stop_sign`.
+
+    Args:
+        style: Figures of the sign, km/h.
+        size: Length, width and height of the body, m.
+        generator: Source of randomness.
+        detail: Level of detail; 0 has no figures.
+    """
+    _, width, height = size
+    radius = 0.5 * width
+    is_worn = bool(generator.random() < WORN_LIMITS)
+    red_material, white_material = _draw_sheeting(generator, is_worn=is_worn)
+    disc = _polygon((16, 32, 48)[detail], 0.0, radius)
+    layers: list[tuple[F64, Material]] = [(disc, red_material), (0.76 * disc, white_material)]
+    if detail:
+        layers += [(radius * stroke, SIGN_INK) for stroke in number_strokes(style, segments=(3, 6, 10)[detail])]
+    parts = [_post("standard", height - 0.1 * width, generator)]
+    parts += _plate(layers, np.array([0.0, height - radius]), 2)
+    return finish(parts, _square_charts(radius, height), size)
 
 
 def _draw_sheeting(generator: np.random.Generator, *, is_worn: bool) -> tuple[Material, Material]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ssad.rendering.bodies.heavy_cabin import bus_interior, truck_cab
 from ssad.rendering.bodies.parts import (
     BLINKER,
     CARGO,
@@ -97,8 +98,11 @@ BUS = Shell(
 )
 
 
-def truck(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """Return a truck of a style that fills its size, m: cab over the front axle, frame, and body or load."""
+def truck(style: str, size: Point, *, generator: np.random.Generator, detail: int, has_driver: bool = True) -> Mesh:
+    """Return a truck of a style that fills its size, m: cab over the front axle, frame, and body or load.
+
+    Its cab shows behind the panes; with `has_driver`, the driver does, too.
+    """
     length, width, height = size
     cab_share, load_share = generator.random(2)
     cab_height = height * {"box": 0.78, "flatbed": 0.97, "tractor": 0.97, "tipper": 0.90}[style] - 0.08 * cab_share
@@ -108,7 +112,12 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
     shell = replace(CAB, radius=min(0.50, 0.19 * cab_height) / cab_height)
     radius = shell.radius * cab_height
     cab_shift = 0.5 * (length - cab_length)
-    parts = [shell_mesh(shell, cab_size, detail=detail).moved(cab_shift)]
+    cab_body = shell_mesh(shell, cab_size, detail=detail)
+    cab_parts = [cab_body]
+    if detail > 0:
+        # The share of the cab also picks the driver: a truck takes the same number of draws with and without.
+        cab_parts += truck_cab(shell, cab_size, cab_body, detail=detail, share=cab_share, has_driver=has_driver)
+    parts = [part.moved(cab_shift) for part in cab_parts]
     panels = [shift_chart(chart, cab_shift) for chart in charts(shell, cab_size)]
     rear_x, cargo_front, deck_height = -0.5 * length, 0.5 * length - cab_length - 0.08, 2.05 * radius
     parts.append(crate((rear_x + 0.05, -0.42, 0.75 * radius), (cargo_front + 0.4, 0.42, deck_height), FRAME))
@@ -300,12 +309,15 @@ def _load(low: Point, high: Point, *, generator: np.random.Generator) -> list[Me
     ]
 
 
-def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """Return a bus of a style (city, coach, bendy) that fills its size, m. Passenger doors are on the right."""
+def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int, has_driver: bool = True) -> Mesh:
+    """Return a bus of a style (city, coach, bendy) that fills its size, m. Passenger doors are on the right.
+
+    Seats show behind the panes; with `has_driver`, the driver and passengers do, too.
+    """
     length, width, height = size
-    stripe_share = generator.random()
+    stripe_share = float(generator.random())
     if style == "bendy":
-        return _bendy(size, detail)
+        return _bendy(size, detail, stripe_share, has_driver=has_driver)
     shell = (
         BUS
         if style == "city"
@@ -320,6 +332,8 @@ def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int)
     roof_share = 0.955 if style == "city" else 1.0
     body_size = (length, width, height * roof_share)
     parts = [shell_mesh(shell, body_size, detail=detail)]
+    if detail > 0:
+        parts += bus_interior(shell, body_size, parts[0], style, stripe_share, detail=detail, has_driver=has_driver)
     parts += _bus_fittings(shell, body_size, detail, rear=True)
     if style == "city":
         parts.append(crate((-0.12 * length, -0.3 * width, 0.94 * height), (0.16 * length, 0.3 * width, height), CARGO))
@@ -371,7 +385,7 @@ def _bus_fittings(shell: Shell, size: Point, detail: int, *, rear: bool, front: 
     return parts
 
 
-def _bendy(size: Point, detail: int) -> Mesh:
+def _bendy(size: Point, detail: int, people_share: float, *, has_driver: bool) -> Mesh:
     """Return an articulated bus: two sections with bellows between them."""
     length, width, height = size
     front_length, rear_length, joint_length = 0.55 * length, 0.40 * length, 0.05 * length
@@ -398,7 +412,19 @@ def _bendy(size: Point, detail: int) -> Mesh:
     for shell, section_length, section_x, is_first in sections:
         section_size = (section_length, width, height)
         fittings = _bus_fittings(shell, section_size, detail, rear=not is_first, front=is_first)
-        parts += [part.moved(section_x) for part in (shell_mesh(shell, section_size, detail=detail), *fittings)]
+        body = shell_mesh(shell, section_size, detail=detail)
+        if detail > 0:
+            fittings += bus_interior(
+                shell,
+                section_size,
+                body,
+                "bendy",
+                people_share,
+                detail=detail,
+                is_first=is_first,
+                has_driver=has_driver,
+            )
+        parts += [part.moved(section_x) for part in (body, *fittings)]
         for chart in charts(shell, section_size):
             panel_name, *part_names = chart.name.split("/")
             if not is_first and panel_name == "front":

@@ -49,21 +49,22 @@ EFFECTS: Final[dict[str, Effect]] = {
 ALL_EFFECTS: Final = frozenset(EFFECTS)
 DEFAULT_EFFECTS: Final = frozenset(effect.name for effect in EFFECTS.values() if effect.is_default)
 NO_EFFECTS: Final[frozenset[str]] = frozenset()
+SETS: Final = {"all": ALL_EFFECTS, "default": DEFAULT_EFFECTS, "none": NO_EFFECTS}
 
 
 def select_effects(*names: str) -> frozenset[str]:
     """Return a set of effects.
 
     Args:
-        names: Names of effects. `all` stands for all of them, `default` for those that are on by default; without
-            any name the set is empty.
+        names: Names of effects. `all` stands for all of them, `default` for those that are on by default, and
+            `none` for none of them, as does no name.
 
     Raises:
         ConfigError: An effect is unknown.
     """
     effects: frozenset[str] = frozenset()
     for name in names:
-        effects |= {"all": ALL_EFFECTS, "default": DEFAULT_EFFECTS}.get(name, frozenset({name}))
+        effects |= SETS.get(name, frozenset({name}))
     check_effects(effects)
     return effects
 

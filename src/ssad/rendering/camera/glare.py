@@ -21,14 +21,17 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import warp as wp
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.types import F64
 from ssad.rendering.camera.kernels import glare as kernels
-from ssad.rendering.camera.lamps import NIGHT_LUX
-from ssad.rendering.camera.sensor import LUMINANCE, SMALLEST, SensorModel
+from ssad.rendering.camera.kernels import lamp_glow, sky
+from ssad.rendering.camera.lamps import NIGHT_LUX, struct_array
+from ssad.rendering.camera.sensor import SMALLEST, SensorModel
 
 if TYPE_CHECKING:
     from ssad.rendering.camera.render import View
     from ssad.rendering.camera.scene import RenderScene
+    from ssad.rendering.camera.visibility import VisibilityPass
 
 CORE: Final = 0.1  # degrees within which the veil does not rise further
 VEIL: Final = ((10.0, 3.0), (5.0, 2.0))  # factor and exponent of the terms of the veil
@@ -53,7 +56,6 @@ LUMINANCES: Final = {
     "street_light": 20_000.0,
     "signal_light": 10_500.0,
 }
-LIT: Final = 0.3  # share of a lamp's light in an image from which it counts as lit
 SUN_RADIUS: Final = math.radians(0.2666)  # rad
 
 
@@ -260,16 +262,15 @@ def add_suns(radiance: Any, tag: Any, views: Sequence[View], lens: F64, lights: 
 
 
 def lamp_gains(scene: RenderScene) -> F64:
-    """Return the light that the lamps of a scene have at night beyond that of an image, and the least that is lit.
+    """Return the light that the lamps of a scene have at night beyond that of an image.
 
     Args:
         scene: Street and bodies.
 
     Returns:
-        [materials, 2]: additional share of light, and luminance in an image above which a lamp is lit; 0 for other
-        materials.
+        Additional share of the light of each material [materials]; 0 for what is no lamp.
     """
-    gains = np.zeros((len(scene.material_names), 2))
+    gains = np.zeros(len(scene.material_names))
     surfaces = scene.surfaces.numpy()
     for row, name in enumerate(scene.material_names):
         if name in LUMINANCES:
@@ -278,12 +279,12 @@ def lamp_gains(scene: RenderScene) -> F64:
             )
             if nominal > 0.0:
                 # A surface of 1 cd/m^2 is as bright as white under pi lux.
-                gains[row] = max(LUMINANCES[name] * math.pi * NIGHT_LUX / nominal - 1.0, 0.0), LIT * nominal
+                gains[row] = max(LUMINANCES[name] * math.pi * NIGHT_LUX / nominal - 1.0, 0.0)
     return gains
 
 
 def add_glow(
-    radiance: Any, material: Any, scene: RenderScene, views: Sequence[View], lights: Sequence[tuple[Any, ...]]
+    radiance: Any, visible: VisibilityPass, scene: RenderScene, views: Sequence[View], lights: Sequence[tuple[Any, ...]]
 ) -> None:
     """Add the glow of lamps to the radiance of views at night whose sensor scatters.
 
@@ -292,28 +293,34 @@ def add_glow(
 
     Args:
         radiance: Linear [B, H, W], a Warp array of vec3; changed in place.
-        material: Row of the material of each pixel [B, H, W], a Warp array; -1 for the sky.
+        visible: Samples of the views.
         scene: Street and bodies.
         views: The views.
         lights: Light of each view, see `ssad.rendering.camera.kernels.sky.Light`.
     """
-    sensors = [view.sensor for view in views]
-    lamps = np.array([light[8] if sensor.scatters else 0.0 for sensor, light in zip(sensors, lights, strict=True)])
+    device, sensors = scene.device, [view.sensor for view in views]
     gains = scene.compute_once(
-        "lamp gains", lambda: wp.array(lamp_gains(scene).astype(np.float32), dtype=float, device=scene.device)
+        "lamp gains", lambda: wp.array(lamp_gains(scene).astype(np.float32), dtype=float, device=device)
     )
     source = wp.empty_like(radiance)
-    lamp_shares = wp.array(lamps.astype(np.float32), dtype=float, device=scene.device)
-    inputs = [radiance, material, gains, lamp_shares]
-    wp.launch(kernels.take_lamps, dim=source.shape[:2], inputs=inputs, outputs=[source], device=scene.device)
+    lanes = 1 if device == "cpu" else source.shape[2]
+    poses = np.array([view.pose for view in views], np.float32)
+    inputs = [
+        scene.geometry,
+        visible.draw_ranges,
+        visible.lens,
+        wp.array(poses, dtype=wp.mat44, device=device),
+        wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device),
+        gains,
+        wp.array(np.array([sensor.scatters for sensor in sensors], np.int32), dtype=int, device=device),
+        visible.samples.shape[1] // source.shape[1],
+        lanes,
+    ]
+    wp.launch(lamp_glow.take_lamps, dim=(*source.shape[:2], lanes), inputs=inputs, outputs=[source], device=device)
     scattered = _scattered(source, sensors, _weights_of(source, sensors))
-    wp.launch(
-        kernels.add_enlarged,
-        dim=source.shape[:2],
-        inputs=[scattered, lamp_shares],
-        outputs=[radiance],
-        device=scene.device,
-    )
+    lamp_shares = np.array([light[8] * sensor.scatters for sensor, light in zip(sensors, lights, strict=True)])
+    inputs = [scattered, wp.array(lamp_shares.astype(np.float32), dtype=float, device=device)]
+    wp.launch(kernels.add_enlarged, dim=source.shape[:2], inputs=inputs, outputs=[radiance], device=device)
 
 
 def has_glow(views: Sequence[View], lights: Sequence[tuple[Any, ...]]) -> bool:

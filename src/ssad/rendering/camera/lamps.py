@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import warp as wp
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, I32
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from ssad.rendering.camera.scene import ObjectTable, RenderScene
 
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
-TO_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB
 NIGHT_LUX = 1.0 / 60.0  # irradiance over pi of one lux at night; basis of the lamps of street and vehicles
 LAMP_NEAR = 0.05  # m: nearer surfaces cast no shadow (the lamp's own housing)
 HEAD_LAMPS = (7.0, (0.60, 0.06), (1.0, 0.97, 0.90), 60.0, 0.055)  # power, spread, colour, reach (m), tilt (rad)
@@ -161,7 +161,7 @@ def low_beam(pose: F64, strength: float, reach: float) -> SceneLamp:
         strength: How bright lamps are, 0 to 1.
         reach: m.
     """
-    power = 2.0 * BEAM_CANDELA * beam_solid_angle() * NIGHT_LUX * strength / float(BEAM_COLOUR @ TO_LUMINANCE)
+    power = 2.0 * BEAM_CANDELA * beam_solid_angle() * NIGHT_LUX * strength / float(np.dot(BEAM_COLOUR, LUMINANCE))
     return SceneLamp(pose @ AHEAD, power, BEAM_SPREAD, BEAM_COLOUR, 0.0, False, reach, False, pattern="low_beam")
 
 
@@ -330,7 +330,7 @@ def _street_lamps(scene: RenderScene, lighting: str) -> list[SceneLamp]:
     power, spread, colour, reach = STREET_LAMP
     soft = 0.5
     if lighting:
-        power = street_lighting.luminaire_power(scene.street, lighting, NIGHT_LUX) / float(colour @ TO_LUMINANCE)
+        power = street_lighting.luminaire_power(scene.street, lighting, NIGHT_LUX) / float(np.dot(colour, LUMINANCE))
         spread, soft, reach = street_lighting.SPREAD, street_lighting.SOFT, street_lighting.REACH
     street_lamps = []
     for x, y, z, heading in scene.street.lamps.astype(np.float64).tolist():

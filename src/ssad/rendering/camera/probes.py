@@ -74,8 +74,8 @@ def gather_probes(
     for view, light in zip(views, lights, strict=True):
         if scene.street is None:
             # The objects of a view are its surroundings.
-            place: Any = id(view.objects)
             centre = np.array([*view.pose[:2, 3], max(float(view.pose[2, 3]), HEIGHT)])
+            place: Any = (id(view.objects), *centre.tolist())
         else:
             place = tuple(np.floor(view.pose[:2, 3] / SQUARE).astype(int).tolist())
             centre = np.array([*((np.array(place) + 0.5) * SQUARE), HEIGHT])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ssad.core.colours import LUMINANCE, linear_to_srgb
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
@@ -25,7 +26,6 @@ from ssad.rendering.camera.lamps import (
     LAMP_NEAR,
     LAMP_SHADOWS,
     NIGHT_LUX,
-    TO_LUMINANCE,
     SceneLamp,
     lamp_lens,
     lamp_strength,
@@ -221,7 +221,8 @@ def scene_light(weather: SceneWeather) -> tuple[tuple[Any, ...], float]:
     night_zenith, night_horizon = 0.010, 0.016
     if weather.lighting == UNLIT:
         # The same weights of zenith and horizon as in the shading of level ground.
-        level = (0.65 * night_zenith * zenith_colour + 0.35 * night_horizon * horizon_colour) @ TO_LUMINANCE
+        level_colour = 0.65 * night_zenith * zenith_colour + 0.35 * night_horizon * horizon_colour
+        level = float(level_colour @ LUMINANCE)
         night_zenith, night_horizon = (night * UNLIT_LUX * NIGHT_LUX / level for night in (night_zenith, night_horizon))
     zenith = zenith_colour * (night_zenith + 0.9 * daylight)
     horizon_glow = np.array([1.0, 0.55, 0.30]) * (1 - warmth) * 0.5 * daylight
@@ -273,7 +274,7 @@ def response(gamma: float = 1.0, contrast: float = 0.0) -> U8:
     """
     light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
     compressed = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
-    encoded = np.where(compressed <= 0.0031308, compressed * 12.92, 1.055 * compressed ** (1 / 2.4) - 0.055)
+    encoded = linear_to_srgb(compressed)
     if (gamma, contrast) != (1.0, 0.0):
         encoded = np.clip(encoded, 0.0, 1.0) ** gamma
         encoded = encoded + contrast * encoded * (1 - encoded) * (2 * encoded - 1)
@@ -403,8 +404,7 @@ def render(
         # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
     material = None
-    glows = has_glow(views, lights)
-    if materials or glows or finishes is not None:
+    if materials or finishes is not None:
         found_materials = wp.empty(shape, dtype=int, device=device)
         inputs = [scene.geometry, visible.draw_ranges, scale, output.tag]
         wp.launch(material_kernels.find_materials, dim=shape, inputs=inputs, outputs=[found_materials], device=device)
@@ -413,8 +413,8 @@ def render(
         surface_arrays = [output.tag, output.depth, output.albedo, output.normal, output.gain]
         inputs = [*finishes, visible.lens, to_world, scene.surfaces, found_materials, *surface_arrays]
         wp.launch(finish_kernels.apply_finish, dim=shape[:2], inputs=inputs, outputs=[output.radiance], device=device)
-    if glows:
-        add_glow(output.radiance, found_materials, scene, views, lights)
+    if has_glow(views, lights):
+        add_glow(output.radiance, visible, scene, views, lights)
     add_suns(output.radiance, output.tag, views, np.array(lens), lights)
     image = develop_radiance(output.radiance, views, exposures)
     arrays = (image, output.radiance, output.tag, output.depth)
@@ -617,6 +617,28 @@ def _near(scene: RenderScene, views: Sequence[View], bodies: ObjectTable, qualit
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
     near_light.shadows = VisibilityPass(scene, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
     return near_light
+
+
+def view_noise(view: View, device: str = "cpu") -> F32 | None:
+    """Return the noise [H, W] of a view's photosites in standard deviations; None if its sensor has none.
+
+    With it, `ssad.rendering.camera.torch_sensor.develop` gives the image that `render` does, noise and all.
+
+    Args:
+        view: The view, whose sensor has a mosaic.
+        device: Device that draws.
+
+    Raises:
+        ConfigError: The sensor has noise and no mosaic.
+    """
+    if view.sensor.noise == 0.0:
+        return None
+    if not view.sensor.mosaic:
+        raise ConfigError("noise of single photosites needs a sensor with a mosaic")
+    noise = wp.empty((view.camera.height, view.camera.width), dtype=float, device=device)
+    wp.launch(sensing.draw_noise, dim=noise.shape, inputs=[view.seed], outputs=[noise], device=device)
+    drawn: F32 = noise.numpy()
+    return drawn
 
 
 def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:

@@ -119,7 +119,6 @@ class SensorModel:
             )
 
 
-LUMINANCE: Final = (0.2126, 0.7152, 0.0722)  # weights of linear RGB in its grey (Rec. 709)
 DEFAULT_SENSOR: Final = SensorModel()
 PINHOLE: Final = SensorModel(blur=0.0, mosaic=False)  # its image is the curve of the light
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.functional import avg_pool2d
 
+from ssad.core.colours import ENCODED_TOE, LINEAR_TOE
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
 from ssad.rendering.meshes.mesh import Mesh, Rectangle
@@ -263,10 +264,12 @@ def to_printable(colour: Tensor) -> Tensor:
 
 def to_linear(colour: Tensor) -> Tensor:
     """Convert sRGB in [0, 1], as in print or a PNG, to the linear RGB of textures."""
-    return torch.where(colour <= 0.04045, colour / 12.92, ((colour.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+    power = ((colour.clamp_min(ENCODED_TOE) + 0.055) / 1.055) ** 2.4
+    return torch.where(colour <= ENCODED_TOE, colour / 12.92, power)
 
 
 def to_srgb(linear: Tensor) -> Tensor:
     """Convert linear RGB in [0, 1] to sRGB: the inverse of `to_linear`."""
     # The clamped root keeps the unused branch of `where` finite.
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+    power = 1.055 * linear.clamp_min(LINEAR_TOE) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= LINEAR_TOE, 12.92 * linear, power)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, pad, pixel_shuffle
 
+from ssad.core.colours import LINEAR_TOE, LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.rendering.camera.glare import (
     GHOST_LEVEL,
@@ -35,7 +36,6 @@ from ssad.rendering.camera.sensor import (
     DEFAULT_SENSOR,
     GREEN,
     KNEE,
-    LUMINANCE,
     OPPOSITE,
     SHOULDER,
     SMALLEST,
@@ -47,7 +47,6 @@ from ssad.rendering.camera.texture import Taps
 from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compress, extend_border, quantisation
 
 TOP = 0.99975 * BRIGHTEST  # light at which the curve is cut off
-TOE = 0.0031308  # light below which sRGB is linear
 
 # ---------------------------------------------------------------- from light to colour
 
@@ -270,7 +269,7 @@ class _Curve(torch.autograd.Function):
         context.save_for_backward(light)
         shouldered, _ = _shoulder(light.clamp(0.0, TOP))
         return torch.where(
-            shouldered <= TOE, shouldered * 12.92, 1.055 * shouldered.clamp_min(TOE) ** (1 / 2.4) - 0.055
+            shouldered <= LINEAR_TOE, shouldered * 12.92, 1.055 * shouldered.clamp_min(LINEAR_TOE) ** (1 / 2.4) - 0.055
         )
 
     @staticmethod
@@ -278,7 +277,7 @@ class _Curve(torch.autograd.Function):
         (light,) = context.saved_tensors
         shouldered, remaining_slope = _shoulder(light.clamp(0.0, TOP))
         encoding_slope = torch.where(
-            shouldered <= TOE, 12.92, (1.055 / 2.4) * shouldered.clamp_min(TOE) ** (1 / 2.4 - 1)
+            shouldered <= LINEAR_TOE, 12.92, (1.055 / 2.4) * shouldered.clamp_min(LINEAR_TOE) ** (1 / 2.4 - 1)
         )
         shoulder_slope = torch.where(light > KNEE, ((1 - KNEE) / SHOULDER) * remaining_slope, 1.0)
         gradient: Tensor = slope * encoding_slope * shoulder_slope * ((light > 0.0) & (light < TOP))

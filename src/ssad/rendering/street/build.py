@@ -16,6 +16,7 @@ from ssad.rendering.street.bays import lay_bays
 from ssad.rendering.street.dressing import (
     Masts,
     place_furniture,
+    place_limit_signs,
     place_signal_masts,
     place_street_lamps,
     plant_grass,
@@ -25,14 +26,14 @@ from ssad.rendering.street.free_ground import FreeGround, sides
 from ssad.rendering.street.markings import paint_markings
 from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
 from ssad.rendering.street.palette import STYLES, TownMaterials, style_of
-from ssad.rendering.street.paving import pave_ground
+from ssad.rendering.street.paving import pave_ground, pave_sidewalks
 from ssad.rendering.street.plots import build_along_streets, fill_blocks
 from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
-from ssad.rendering.street.yards import lay_yards
+from ssad.rendering.street.yards import entrances, lay_yards
 from ssad.world.roads.library import load_town
 
-REVISION = 6  # of the construction: a cached street of another revision is not used
+REVISION = 10  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
@@ -62,6 +63,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     paint_markings(builder, graph, materials)
     place_signal_masts(builder, graph, free_ground, materials, masts)
     place_street_lamps(builder, free_ground, materials, street_sides, masts)
+    limit_signs = place_limit_signs(graph, free_ground, street_sides)
     yards = lay_yards(builder, free_ground, materials, street_sides)
     plots = build_along_streets(builder, free_ground, materials, street_sides)
     fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
@@ -69,6 +71,8 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     plant_trees(builder, free_ground, materials, plots.parks)
     plant_grass(builder, free_ground, materials, street_sides)
     bays = lay_bays(builder, free_ground, materials)
+    yard_entrances = entrances(free_ground, yards.frontages, _f32(bays, 5).astype(np.float64))
+    pave_sidewalks(builder, graph, materials, yard_entrances)
     geometry = join(builder.pieces)
     origin, nx, ny, order, offset = tiles(np.concatenate(builder.owner), geometry.levels)
     return Street(
@@ -93,6 +97,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
         parking=_f32(plots.parking + yards.cells, 3),
         bays=_f32(bays, 5),
         yards=_f32(yards.rows, 5),
+        limit_signs=_f32(limit_signs, 5),
     )
 
 
@@ -128,6 +133,8 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
         "sign_kind",
         "rule_sign",
         "rule_lane",
+        "speed_limit",
+        "left_hand",
     ):
         digest.update(getattr(graph, key).tobytes())
     path = home_folder() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"

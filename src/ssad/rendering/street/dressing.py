@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import LaneType
 from ssad.rendering.street.free_ground import CELL, FreeGround, Side
 from ssad.rendering.street.furniture import bench, bollard, lamp, litter_bin, planter, shelter, sign, signal_mast
 from ssad.rendering.street.model import NEAR
@@ -18,6 +20,11 @@ from ssad.rendering.street.triangles import TriangleBuilder, flat
 BIN_ROOM = 0.45  # m between a kerb and the middle of a thing beside it
 TUFT_SPACING = 0.8  # m between tufts of grass along a verge
 MAX_TUFTS = 4000  # of a town
+LIMITS = (10, 140)  # km/h, speed limits that signs show
+LIMIT_STATIONS = (12.0, 40.0, 2.0)  # m from the start of a road to its speed-limit sign: first, end, step
+LIMIT_END = 18.0  # m before the end of a road that stay without speed-limit sign
+REPEAT = 120.0  # m from one speed-limit sign of a road to the next
+SIGHT = 6.0  # m before a speed-limit sign on which nothing stands
 
 
 @dataclass
@@ -111,6 +118,48 @@ def _clear_position(ground: FreeGround, xy: tuple[float, float], yaw: float) -> 
     return None
 
 
+def place_limit_signs(
+    graph: LaneGraph, ground: FreeGround, street_sides: list[Side]
+) -> list[tuple[float, float, float, float, float]]:
+    """Take the ground of speed-limit signs: after junctions, where a limit changes, and again each `REPEAT` m.
+
+    The signs are bodies of their own. They stand at the right-hand edge, with a clear view over `SIGHT` m.
+
+    Returns:
+        x, y, yaw of the traffic, z of the foot, and the limit rounded to 10 km/h of each sign.
+    """
+    signs: list[tuple[float, float, float, float, float]] = []
+    for side in [] if graph.left_hand[0] else street_sides:
+        lane = side.edge.lane
+        while lane >= 0 and graph.kind[lane] != LaneType.DRIVING:
+            left_lane = int(graph.left[lane])
+            lane = left_lane if left_lane >= 0 and graph.is_same_direction(lane, left_lane) else -1
+        if lane < 0:
+            continue
+        limit = _sign_limit(graph, lane)
+        before = graph.predecessors(lane).tolist()
+        if not LIMITS[0] <= limit <= LIMITS[1]:
+            continue
+        is_announced = any(graph.junction[other] >= 0 or _sign_limit(graph, other) != limit for other in before)
+        starts = [*([0.0] if is_announced else []), *np.arange(REPEAT, side.length, REPEAT).tolist()]
+        for start in starts:
+            for station, outward in product(np.arange(*LIMIT_STATIONS).tolist(), (0.1, 0.3, 0.5, 0.7)):
+                if start + station > side.length - LIMIT_END:
+                    continue
+                x, y, yaw = side.pose(start + station, _kerb_offset(side) + outward)
+                view = [(x - along * np.cos(yaw), y - along * np.sin(yaw)) for along in np.arange(0.0, SIGHT, CELL)]
+                if ground.is_clear((x, y), size=0.1) and not ground.is_occupied(view):
+                    signs.append((x, y, yaw, KERB if side.kerb else 0.0, float(limit)))
+                    ground.occupy(view)
+                    break
+    return signs
+
+
+def _sign_limit(graph: LaneGraph, lane: int) -> int:
+    """Return the speed limit of a lane as on a sign: rounded to 10 km/h."""
+    return 10 * round(0.36 * float(graph.speed_limit[lane]))
+
+
 def place_furniture(
     triangles: TriangleBuilder, ground: FreeGround, materials: TownMaterials, sides: list[Side]
 ) -> None:
@@ -122,7 +171,7 @@ def place_furniture(
         "bollard": bollard(materials),
         "shelter": shelter(materials),
     }
-    stock |= {name: sign(name, materials) for name in ("limit", "crossing", "parking")}
+    stock |= {name: sign(name, materials) for name in ("crossing", "parking")}
     planter_piece, planter_bush = planter(materials), bush(materials)
     trees = [tree(tree_piece, materials) for tree_piece in ("round", "birch", "round")]
     for side in sides:
@@ -141,7 +190,7 @@ def place_furniture(
                             for side_offset in (-0.8, 0.0, 0.8)
                         ]
                     )
-        signs: list[tuple[str, float]] = [("limit", 8.0)] if side.length > 60.0 and rng.random() < 0.4 else []
+        signs: list[tuple[str, float]] = []
         if side.frontage:
             signs += [("crossing", side.length - 7.0)] if rng.random() < 0.5 else []
             signs += [("parking", 0.5 * side.length)] if rng.random() < 0.12 else []

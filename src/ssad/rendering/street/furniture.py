@@ -108,13 +108,12 @@ def signal_mast(materials: TownMaterials, reach: float) -> SignalMast:
 
 
 def sign(kind: str, materials: TownMaterials) -> TrianglePiece:
-    """A traffic sign on a post, facing along x: give_way, limit, crossing, parking."""
+    """A traffic sign on a post, facing along x: give_way, crossing, parking."""
     sign_materials = materials.sign
     parts = [cylinder((0.035, 0.035), (0.0, 2.75), materials.metal, sides=5, levels=VISIBLE)]
     z, turn = 2.35, np.pi / 2
     shapes: dict[str, list[tuple[float, int, float, int]]] = {  # radius, sides, turn, material
         "give_way": [(0.48, 3, -turn, sign_materials["red"]), (0.30, 3, -turn, sign_materials["white"])],
-        "limit": [(0.36, 16, 0.0, sign_materials["red"]), (0.275, 16, 0.0, sign_materials["white"])],
         "crossing": [(0.46, 4, np.pi / 4, sign_materials["blue"]), (0.34, 3, turn, sign_materials["white"])],
         "parking": [(0.44, 4, np.pi / 4, sign_materials["blue"])],
     }
@@ -127,14 +126,11 @@ def sign(kind: str, materials: TownMaterials) -> TrianglePiece:
     faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
     parts.append(TrianglePiece(back_vertices, faces, -back.normals, uv, back.material, back.levels))
     bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
-        "limit": [(-0.14, -0.11, -0.03, 0.11), (0.03, -0.11, 0.14, 0.11)],
         "parking": [(-0.1, -0.18, -0.03, 0.18), (-0.03, 0.0, 0.12, 0.18)],
     }
     for y0, z0, y1, z1 in bars.get(kind, []):
         quad = [[0.065, y0, z + z0], [0.065, y1, z + z0], [0.065, y1, z + z1], [0.065, y0, z + z1]]
-        parts.append(
-            flat(np.array([quad]), materials.black if kind == "limit" else sign_materials["white"], levels=NEAR)
-        )
+        parts.append(flat(np.array([quad]), sign_materials["white"], levels=NEAR))
     return join(parts)
 
 

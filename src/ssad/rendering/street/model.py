@@ -17,7 +17,7 @@ from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import array_dtypes
 from ssad.rendering.meshes.mesh import F32, I32, Material
 
-FORMAT = 2  # of the .npz file
+FORMAT = 3  # of the .npz file
 TILE = 32.0  # m
 LEVELS = 3
 NEAR, MID, FAR = 1, 2, 4  # bits of the levels at which a face is drawn
@@ -58,6 +58,7 @@ class Street:
             of the bay; room to either end of the bay, m.
         yards: Places of long vehicles in yards behind the pavement [., 5], with the columns of `bays`; room to either
             end of the place.
+        limit_signs: Speed-limit signs [., 5]: x, y and yaw of the traffic; z of the foot, m; limit, km/h.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Street:
     parking: F32
     bays: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
     yards: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
+    limit_signs: F32 = field(default_factory=lambda: np.zeros((0, 5), np.float32))
 
     def __post_init__(self) -> None:
         # Streets are cached and shared between scenes, so their arrays must not change.
@@ -142,7 +144,7 @@ class Street:
                 getattr(self, array_name).shape == shape,
                 f"{array_name} has shape {getattr(self, array_name).shape}, not {shape}",
             )
-        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking", "bays", "yards"):
+        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking", "bays", "yards", "limit_signs"):
             require(
                 bool(np.isfinite(getattr(self, array_name)).all()), f"{array_name} holds a number that is not finite"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,11 +18,18 @@ from ssad.rendering.street.triangles import ALL, HORIZON_OWNER, TriangleBuilder,
 
 KERB = 0.13  # m, height of a sidewalk
 STONE = 0.16  # m, width of a kerb stone
+LOWERED = 0.03  # m, height of a kerb at the entrance of a yard
+RAMP = 0.7  # m along the kerb, from the lowered height to the full one
+SLOPE = 0.24  # m across the pavement, from the kerb stone to the full height
 EARTH = 0.10  # m, height of the ground behind a sidewalk
 BELOW = -0.03  # m, height of the ground beside a road without one
 FAR_AWAY = 3000.0  # m
 FIELD_SHARES = (0.4, 0.2, 0.2, 0.1, 0.1)  # of `TownMaterials.fields`
 STRAIGHT = 16.0  # m, longest quad of a straight line
+
+
+Entrance = tuple[int, float, float]
+"""Lane of a sidewalk, and the stations on its right edge between which its kerb is lowered, m."""
 
 
 @dataclass(frozen=True)
@@ -70,22 +78,22 @@ def _bends(yaw: F32, arc_lengths: F32, width: F32) -> list[int]:
     return [*indices, last]
 
 
-def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, levels: int = ALL) -> TrianglePiece:
-    """Return quads between two lines [n, 2] at heights z (left, right)."""
-    right_line = np.column_stack([right, np.full(len(right), z[1])])
-    left_line = np.column_stack([left, np.full(len(left), z[0])])
+def ribbon(
+    left: F64, right: F64, z: tuple[float | F64, float | F64], material: int, *, levels: int = ALL
+) -> TrianglePiece:
+    """Return quads between two lines [n, 2] at heights z (left, right), each one height or one for each point [n]."""
+    right_line = np.column_stack([right, np.broadcast_to(z[1], len(right))])
+    left_line = np.column_stack([left, np.broadcast_to(z[0], len(left))])
     return flat(
         np.stack([right_line[:-1], right_line[1:], left_line[1:], left_line[:-1]], axis=1), material, levels=levels
     )
 
 
 def pave_ground(triangles: TriangleBuilder, graph: LaneGraph, ground: Ground, materials: TownMaterials) -> None:
-    """Road surface, sidewalks and kerbs, earth, far ground."""
+    """Road surface, earth, far ground; `pave_sidewalks` adds the sidewalks."""
     origin = np.array(ground.origin)
     vertices, faces = region_mesh(ground.road[::2, ::2] - 0.3)
     triangles.add(level_ground(origin + 2.0 * vertices, faces, np.zeros(len(vertices)), materials.asphalt))
-    for lane in np.flatnonzero(np.isin(graph.kind, [int(lane_kind) for lane_kind in WALK])).tolist():
-        _pave_sidewalk(triangles, graph, lane, materials)
     vertices, faces = region_mesh(-0.7 - ground.open()[::4, ::4], largest=8)
     xy = origin + 4.0 * vertices
     road, walk = ground.at(ground.road, xy), ground.at(ground.walk, xy)
@@ -116,9 +124,52 @@ def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) ->
     )
 
 
-def _pave_sidewalk(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materials: TownMaterials) -> None:
+def pave_sidewalks(
+    triangles: TriangleBuilder, graph: LaneGraph, materials: TownMaterials, entrances: Sequence[Entrance]
+) -> None:
+    """Sidewalks with kerbs, which are lowered at entrances."""
+    for lane in np.flatnonzero(np.isin(graph.kind, [int(lane_kind) for lane_kind in WALK])).tolist():
+        lane_entrances = [(start, end) for entrance_lane, start, end in entrances if entrance_lane == lane]
+        _pave_sidewalk(triangles, graph, lane, materials, lane_entrances)
+
+
+def _with_stations(right: Edge, left: Edge, stations: F64) -> tuple[Edge, Edge]:
+    """Return both edges of a lane with more points, at arc lengths of the right one."""
+    indices = np.arange(len(right.s), dtype=np.float64)
+    positions = np.unique(np.concatenate([indices, np.interp(stations, right.s, indices)]))
+
+    def resample(edge: Edge) -> Edge:
+        x, y, yaw, arc_length = (
+            np.interp(positions, indices, values)
+            for values in (edge.xy[:, 0], edge.xy[:, 1], np.unwrap(edge.yaw), edge.s)
+        )
+        return Edge(edge.lane, np.column_stack([x, y]), yaw, arc_length)
+
+    return resample(right), resample(left)
+
+
+def _kerb_heights(stations: F64, entrances: Sequence[tuple[float, float]]) -> F64:
+    """Return the height of the kerb at stations [n], m."""
+    heights = np.full(len(stations), KERB)
+    for start, end in entrances:
+        distances = np.maximum(np.maximum(start - stations, stations - end), 0.0)
+        heights = np.minimum(heights, LOWERED + (KERB - LOWERED) * np.clip(distances / RAMP, 0.0, 1.0))
+    return heights
+
+
+def _pave_sidewalk(
+    triangles: TriangleBuilder,
+    graph: LaneGraph,
+    lane: int,
+    materials: TownMaterials,
+    entrances: Sequence[tuple[float, float]],
+) -> None:
     """A raised strip: kerb stones and their face along the road, slabs, and faces at the back and at free ends."""
     right, left = lane_edge(graph, lane, 0.0), lane_edge(graph, lane, 1.0)
+    if entrances:
+        limits = [limit for start, end in entrances for limit in (start - RAMP, start, end, end + RAMP)]
+        right, left = _with_stations(right, left, np.clip(limits, 0.0, right.s[-1]))
+    heights = _kerb_heights(right.s, entrances)
     if float(graph.width[graph.points(lane)].max()) < 0.3:
         return
     inner, outer = (left.xy, right.xy), (right.xy, left.xy)
@@ -127,15 +178,22 @@ def _pave_sidewalk(triangles: TriangleBuilder, graph: LaneGraph, lane: int, mate
         inner_line = edge - side * STONE * left.normal
         if neighbour < 0:
             # The back: a face down to the earth.
-            heights = (0.0, KERB) if side > 0 else (KERB, 0.0)
-            triangles.add(ribbon(edge, edge, heights, materials.slab))
+            back_heights = (0.0, KERB) if side > 0 else (KERB, 0.0)
+            triangles.add(ribbon(edge, edge, back_heights, materials.slab))
             slab_edges.append(edge)
             continue
-        top = (edge, inner_line) if side > 0 else (inner_line, edge)
-        triangles.add(ribbon(*top, (KERB, KERB), materials.kerb))
+        # Only the side of the road is lowered.
+        edge_heights = heights if side > 0 else np.full(len(heights), KERB)
+        inner_heights = edge_heights + (KERB - edge_heights) * STONE / (STONE + SLOPE)
+        triangles.add(_strip(side, (edge, inner_line), (edge_heights, inner_heights), materials.kerb))
         base_line = edge + side * 0.02 * left.normal
-        face_lines = (base_line, edge) if side > 0 else (edge, base_line)
-        triangles.add(ribbon(*face_lines, (-0.02, KERB) if side > 0 else (KERB, -0.02), materials.kerb))
+        triangles.add(_strip(side, (base_line, edge), (np.full(len(heights), -0.02), edge_heights), materials.kerb))
+        if side > 0 and entrances:
+            slope_line = inner_line - side * SLOPE * left.normal
+            triangles.add(
+                _strip(side, (inner_line, slope_line), (inner_heights, np.full(len(heights), KERB)), materials.slab)
+            )
+            inner_line = slope_line
         slab_edges.append(inner_line)
     triangles.add(ribbon(slab_edges[0], slab_edges[1], (KERB, KERB), materials.slab))
     for neighbours, end_index, corner_order in (
@@ -149,6 +207,14 @@ def _pave_sidewalk(triangles: TriangleBuilder, graph: LaneGraph, lane: int, mate
             )
             corners = [[*first_corner, -0.02], [*second_corner, -0.02], [*second_corner, KERB], [*first_corner, KERB]]
             triangles.add(flat(np.array([corners]), materials.kerb))
+
+
+def _strip(side: float, lines: tuple[F64, F64], heights: tuple[F64, F64], material: int) -> TrianglePiece:
+    """Return the ribbon between an outer and an inner line [n, 2] of a side, left (1) or right (-1)."""
+    (outer, inner), (outer_heights, inner_heights) = lines, heights
+    if side > 0:
+        return ribbon(outer, inner, (outer_heights, inner_heights), material)
+    return ribbon(inner, outer, (inner_heights, outer_heights), material)
 
 
 def _add_far_ground(triangles: TriangleBuilder, ground: Ground, materials: TownMaterials) -> None:

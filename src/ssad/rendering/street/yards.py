@@ -8,10 +8,11 @@ import numpy as np
 
 from ssad.core.rotations import wrap_scalar
 from ssad.rendering.meshes.mesh import F64
+from ssad.rendering.street.bays import SPACING
 from ssad.rendering.street.free_ground import FreeGround, Side, footprint, place
 from ssad.rendering.street.model import MID, NEAR
 from ssad.rendering.street.palette import TownMaterials
-from ssad.rendering.street.paving import EARTH
+from ssad.rendering.street.paving import EARTH, RAMP, Entrance
 from ssad.rendering.street.triangles import ALL, TriangleBuilder, flat
 
 Pose = tuple[float, float, float]
@@ -27,16 +28,24 @@ ROWS = 0.6  # of the yards, as far as there is room
 MAX_TURN = 0.25  # rad along a yard: yards are straight
 STEP = 3.0  # m to the next attempt where there is no room
 LINE = 0.1  # m, width of the lines
+ROW_ENTRANCE = 8.0  # m, width of the entrance of places along the street; cells are entered everywhere
+LEAST_ENTRANCE = 3.0  # m
+ENTRANCE_STEP = 0.5  # m between the stations at which the pavement is tested
 TOP = EARTH + 0.024  # m, height of a yard: above the drives and paths of houses
 DEPTHS = (ROW_DEPTH + BACK, CELL_DEPTH + BACK)  # m that yards take
 
 
 @dataclass
 class Yards:
-    """Places in yards: those of `Street.parking`, and those of `Street.yards`."""
+    """Places in yards: those of `Street.parking`, and those of `Street.yards`.
+
+    `frontages` are the sides of streets with the stations between which a yard lies, and the greatest width of its
+    entrance, m.
+    """
 
     cells: list[Pose] = field(default_factory=list)
     rows: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+    frontages: list[tuple[Side, float, float, float]] = field(default_factory=list)
 
 
 def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMaterials, sides: list[Side]) -> Yards:
@@ -73,6 +82,7 @@ def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMat
                 _lines(place_count, width, depth, is_row=is_row),
             )
             ground.occupy(yard_footprint)
+            yards.frontages.append((side, station, station + length, ROW_ENTRANCE if is_row else length))
             middles = length * ((np.arange(place_count) + 0.5) / place_count - 0.5)
             if is_row:
                 place_points = place(yard_pose, np.column_stack([middles, np.zeros(place_count)])).tolist()
@@ -82,6 +92,46 @@ def lay_yards(triangles: TriangleBuilder, ground: FreeGround, materials: TownMat
                 yards.cells += [(*point, yaw + 0.5 * np.pi) for point in place_points]
             station += length + float(rng.uniform(*GAP))
     return yards
+
+
+def entrances(ground: FreeGround, frontages: list[tuple[Side, float, float, float]], bays: F64) -> list[Entrance]:
+    """Return the entrances of yards: the longest stretch of each with neither a bay nor an object at its kerb.
+
+    Args:
+        ground: The ground, on which all objects of the street are marked.
+        frontages: See `Yards`.
+        bays: See `Street.bays`, [., 5].
+
+    Returns:
+        The entrances; a yard behind bays has none.
+    """
+    yard_entrances: list[Entrance] = []
+    for side, start, end, max_width in frontages:
+        stations = np.arange(start, end, ENTRANCE_STEP)
+        is_free = np.zeros(len(stations) + 1, bool)
+        for index, station in enumerate(stations.tolist()):
+            pose = side.pose(station)
+            strip = footprint(pose, (0.0, ENTRANCE_STEP), (0.0, side.kerb))
+            is_free[index] = not ground.is_occupied(strip) and not _in_bay(strip, bays)
+        edges = np.flatnonzero(np.diff(is_free.astype(int), prepend=0)).reshape(-1, 2) * ENTRANCE_STEP + start
+        if not len(edges):
+            continue
+        first, last = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
+        # The kerb rises to its full height before the next obstacle.
+        middle, width = 0.5 * (first + last), min(last - first - 2.0 * RAMP, max_width)
+        if width >= LEAST_ENTRANCE:
+            yard_entrances.append((side.edge.lane, middle - 0.5 * width, middle + 0.5 * width))
+    return yard_entrances
+
+
+def _in_bay(points: F64, bays: F64) -> bool:
+    """Return whether one of the points [n, 2] lies in a bay."""
+    offsets = points[:, None] - bays[:, :2]
+    cosine, sine = np.cos(bays[:, 2]), np.sin(bays[:, 2])
+    along = offsets[..., 0] * cosine + offsets[..., 1] * sine
+    outwards = offsets[..., 0] * sine - offsets[..., 1] * cosine
+    is_inside = (np.abs(along) < 0.5 * SPACING + 1.0) & (outwards > -0.5) & (outwards < bays[:, 3] + 0.1)
+    return bool(is_inside.any())
 
 
 def _lines(place_count: int, width: float, depth: float, *, is_row: bool) -> F64:

@@ -57,7 +57,7 @@ def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, RelightableImag
     target = clip.target
     light: Shadow | Flashlight = Shadow() if hour == "low_sun" else Flashlight()
     middle = {name: 0.5 * (low + high) for name, (low, high) in light.ranges(target).items()}
-    middle |= {"left_b": 1.2, "up_c": 2.0, "lumens": 60.0}
+    middle |= {"left_b": 1.2, "up_c": 2.0, "lumens": 300.0}
     values = {name: value for name, value in middle.items() if name in light.ranges(target)}
     before, after = clip.render().astype(int), clip.render(light.edit(values, target)).astype(int)
     picture = clip.lit()

@@ -22,8 +22,11 @@ from ssad.recorders.nuscenes import SENSOR
 from ssad.recorders.target_images import TARGET, record_target_images, recorded_views
 from ssad.recorders.target_recording import TargetRecording
 from ssad.recorders.viewpoints import look_at
-from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.effects import ALL_EFFECTS
+from ssad.rendering.camera.glare import with_lens_effects
+from ssad.rendering.camera.render import Rendering, render, view_noise
 from ssad.rendering.camera.scene import TextureLayer
+from ssad.rendering.camera.scene_edit import render_with
 from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg
 from ssad.rendering.camera.torch_sensor import develop
@@ -44,8 +47,18 @@ def others_are_boxes() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without the effects of the lens, so that a texture changes a part of the image alone."""
     out = tmp_path_factory.mktemp("textured") / "clips"
-    record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+    effects = ALL_EFFECTS - {"bloom", "flare"}
+    record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0, effects=effects), workers=0)
+    return out
+
+
+@pytest.fixture(scope="module")
+def glowing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With all effects."""
+    out = tmp_path_factory.mktemp("glowing") / "clips"
+    record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=160, behind=8.0), workers=0)
     return out
 
 
@@ -54,22 +67,29 @@ def colours() -> dict[int, torch.Tensor]:
     return {0: torch.rand((3, 32, 32), generator=draws), 1: torch.rand((3, 16, 24), generator=draws)}
 
 
-def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
-    """In the whole part that changes; elsewhere the recorded picture stands."""
-    textures = colours()
+@pytest.mark.parametrize("scatters", [False, True], ids=["lens", "glowing lens"])
+def test_a_texture_looks_as_if_rendered_anew(scatters: bool, request: pytest.FixtureRequest) -> None:
+    """In the whole part that changes, with the noise of the recording; elsewhere the recorded picture stands."""
+    folder, textures = request.getfixturevalue("glowing" if scatters else "folder"), colours()
     for clip, seen in zip(texturable_images(folder, LAYERS), recorded_views(folder), strict=True):
-        picture = render(seen.scene, [seen.with_layers(*LAYERS)])
+        worn = seen.with_layers(*LAYERS)
+        picture = render(seen.scene, [worn], quality=seen.quality)
+        assert ("bloom" in picture.effects) == scatters
         radiance = torch.tensor(picture.radiance)
         for number, size in SIZES.items():
             radiance = retexture(texture_taps(picture, size, texture=number), textures[number], radiance)
-        developed = develop(radiance, float(picture.exposure[0]), SENSOR)
+        noise, sensor = view_noise(worn), with_lens_effects(SENSOR, picture.effects)
+        assert noise is not None
+        developed = develop(radiance, float(picture.exposure[0]), sensor, torch.tensor(noise)[None])
+        rendered = render_with(seen.scene, [worn], textures, quality=seen.quality).image[0].astype(float)
+        assert np.abs(developed[0].permute(1, 2, 0).numpy() * 255 - rendered).max() < 1.5, "the renderer's own image"
         before = torch.tensor(read_image(folder / "images" / clip.file)).permute(2, 0, 1)[None].float() / 255
         _, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
         for quality, whole in ((None, developed), (92, jpeg(developed, 92))):
             shown = clip.prepare(SIZES, quality=quality).show(textures)
             changed = (shown != before).any(1)[0]
             assert changed.sum() > 0.3 * w * h
-            assert not changed[: max(int(y) - 40, 0)].any(), "far from the car nothing changes"
+            assert scatters or not changed[: max(int(y) - 40, 0)].any(), "far from the car nothing changes"
             torch.testing.assert_close(shown[..., changed], whole[..., changed], rtol=0, atol=1e-5)
             assert torch.equal(shown[..., ~changed], before[..., ~changed])
 
@@ -130,7 +150,7 @@ def test_a_texture_lies_on_the_same_faces_in_every_town(same_metal: list[Renderi
     some = np.flatnonzero(both)[::7]
     one, other = faces_at(here[some]), faces_at(there[some])
     assert len(np.unique(one)) > 50
-    assert (one == other).mean() > 0.98, "the same faces"
+    assert (one == other).mean() > 0.97, "the same faces"
 
 
 def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +171,7 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(AssertionError, match="rendered again"):
         next(texturable_images(folder, (TextureLayer(0, opacity=0.9),)))
     with monkeypatch.context() as other:
-        other.setattr(module, "recording_of", lambda *given: {"seed": 1})
+        other.setattr(module, "recording_of", lambda *given: {"seed": 1, "effects": []})
         with pytest.raises(AssertionError, match="rendered again"):
             next(texturable_images(folder, LAYERS))
     monkeypatch.setattr(module, "_drawing", lambda: "another version")
@@ -224,18 +244,19 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     black, white = (ready.show({0: torch.full((3, *surface.size), value)}) for value in (0.05, 0.9))
     brighter = ((white - black).amax(1)[0] > 0.1).numpy()
     (seen,) = recorded_views(folder)
-    picture = render(seen.scene, [seen.view])
+    picture = render(seen.scene, [seen.view], quality=seen.quality)
     assert (picture.tag[0][brighter] == 0).mean() > 0.9, "on the street"
     x, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
     rows, columns = np.nonzero(brighter)
     assert brighter.sum() > 0.1 * w * h
     assert rows.mean() > y + h - 2, "nearer than the car"
     assert x < columns.mean() < x + w
-    anew = render(seen.scene, [seen.with_layers(surface.layer)])
+    noise, anew = view_noise(seen.view), render(seen.scene, [seen.with_layers(surface.layer)], quality=seen.quality)
+    assert noise is not None
     radiance = retexture(
         texture_taps(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance)
     )
-    whole = jpeg(develop(radiance, float(anew.exposure[0]), SENSOR), 92)
+    whole = jpeg(develop(radiance, float(anew.exposure[0]), SENSOR, torch.tensor(noise)[None]), 92)
     changed = torch.as_tensor(brighter)
     torch.testing.assert_close(white[..., changed], whole[..., changed], rtol=0, atol=1e-5)
 

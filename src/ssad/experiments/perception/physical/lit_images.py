@@ -18,6 +18,7 @@ from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import RecordedTargetImages, drive_of, target_truth
 from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturableImage, visible_part
 from ssad.recorders.target_images import TARGET, RecordedView, image_rows, recorded_views
+from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
@@ -58,14 +59,15 @@ class RelightableImage:
                 lambda: RenderScene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device),
             )
         view = edit.on(self.view.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
-        rendering = render_with(scene, [view], edit.textures, edit.masks)
+        rendering = render_with(scene, [view], edit.textures, edit.masks, quality=self.view.quality)
         # Detectors see recordings through JPEG, so edited images must pass through it as well.
         return decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
 
     def projected(self, edit: SceneEdit) -> TexturableImage:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
-        rendering = render(self.scene, [edit.on(self.view.view, TARGET)])
-        visible = visible_part(rendering)
+        view = edit.on(self.view.view, TARGET)
+        rendering = render(self.scene, [view], quality=self.view.quality)
+        visible = visible_part(rendering, view)
         corner = int(visible["corner"][0]), int(visible["corner"][1])
         image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
         return TexturableImage(
@@ -77,12 +79,23 @@ class RelightableImage:
             visible["radiance"],
             float(visible["exposure"]),
             visible["fragments"],
+            with_lens_effects(view.sensor, rendering.effects),
+            visible["noise"],
         )
 
     def lit(self, device: str | torch.device = "cpu") -> LitImage:
         """Return the image as a function of the light on its target."""
         rows, columns = _part(self.view)
-        return render_lit_image(self.scene, self.view.view, TARGET, rows, columns, blind=self.cards, device=device)
+        return render_lit_image(
+            self.scene,
+            self.view.view,
+            TARGET,
+            rows,
+            columns,
+            blind=self.cards,
+            quality=self.view.quality,
+            device=device,
+        )
 
 
 def _part(view: RecordedView) -> tuple[slice, slice]:

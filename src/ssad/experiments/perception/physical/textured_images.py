@@ -25,9 +25,8 @@ from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
 from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
-from ssad.rendering.camera.effects import DEFAULT_EFFECTS
 from ssad.rendering.camera.glare import with_lens_effects
-from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.render import Rendering, View, render, view_noise
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
@@ -36,7 +35,6 @@ from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generat
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
-RECORDED_SENSOR = with_lens_effects(SENSOR, DEFAULT_EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +50,8 @@ class TexturableImage:
         radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
+        sensor: Sensor of the camera, with the effects of its lens.
+        noise: Noise of the photosites of the part in standard deviations [h, w]; None if there is none.
     """
 
     file: str
@@ -62,6 +62,8 @@ class TexturableImage:
     radiance: F32
     exposure: float
     fragments: Any
+    sensor: SensorModel
+    noise: F32 | None = None
 
     def prepare(
         self,
@@ -69,7 +71,6 @@ class TexturableImage:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
-        sensor: SensorModel = RECORDED_SENSOR,
         device: str | torch.device = "cpu",
     ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
@@ -78,7 +79,6 @@ class TexturableImage:
             sizes: Number of each texture -> its height and width, or one side, texels. It must cover all textures.
             masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
             quality: JPEG quality, as recorded; None: no compression.
-            sensor: Sensor of the camera.
             device: Device of the images.
 
         Raises:
@@ -99,11 +99,14 @@ class TexturableImage:
             for number, texture_size in sizes.items()
         }
         touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
-        window = ChangedWindow.around(touched_pixels, (1, height, width), sensor, quality=quality)
+        window = ChangedWindow.around(touched_pixels, (1, height, width), self.sensor, quality=quality)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
-        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image)
+        noise = None
+        if self.noise is not None:
+            noise = _cut(torch.tensor(self.noise), rectangle, window.read[0]).to(device)
+        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image, noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +119,7 @@ class PreparedImage:
         exposure: Factor on the radiance.
         taps: Contribution of each texture to the pixels of the image, by its number.
         before: The whole image as recorded, uint8 [3, H, W].
+        noise: Noise of the photosites of the part, as recorded [h, w]; None if there is none.
     """
 
     window: ChangedWindow
@@ -123,6 +127,7 @@ class PreparedImage:
     exposure: float
     taps: Mapping[int, Taps]
     before: Tensor
+    noise: Tensor | None = None
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
         """Return the image with textures on its target, [1, 3, H, W].
@@ -149,7 +154,7 @@ class PreparedImage:
         Args:
             pictures: Of one size, sensor and JPEG quality.
             textures: Number -> linear albedo in 0 to 1, one for each picture [B, 3, h, w].
-            noise: Of each picture, draws the sensor's noise where it changes; None for none there.
+            noise: Of each picture, draws new noise of the sensor where it changes; None for that of the recording.
 
         Returns:
             [B, 3, H, W] in [0, 1], differentiable in the textures.
@@ -196,18 +201,25 @@ class PreparedImage:
         noise: Sequence[torch.Generator] | None,
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
-        noise_sample = None
+        samples = [prepared.noise for prepared in pictures]
         if noise is not None:
+            # Noise is drawn for the image's own window, so that it does not depend on the batch.
             mosaic = window.sensor.mosaic
-            noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
+            shapes = [prepared.part.shape[: 2 if mosaic else 3] for prepared in pictures]
             generators = generators_on_device(noise, radiance.device)
-            for image_noise, prepared, read_rectangle, rng in zip(
-                noise_sample, pictures, window.read, generators, strict=True
+            samples = [
+                torch.randn(shape, generator=rng, device=rng.device)
+                for shape, rng in zip(shapes, generators, strict=True)
+            ]
+        noise_sample = None
+        if (first_sample := samples[0]) is not None:
+            noise_sample = radiance.new_zeros((*radiance.shape[:3], *first_sample.shape[2:]))
+            for image_noise, prepared, read_rectangle, sample in zip(
+                noise_sample, pictures, window.read, samples, strict=True
             ):
                 target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
-                # Noise is drawn for the image's own window, so that it does not depend on the batch.
-                window_shape = prepared.part.shape[:2] if mosaic else prepared.part.shape
-                image_noise[target_slices] = torch.randn(window_shape, generator=rng, device=rng.device)[source_slices]
+                if sample is not None:
+                    image_noise[target_slices] = sample[source_slices]
         exposure = torch.tensor([prepared.exposure for prepared in pictures]).to(radiance)
         recorded_images = torch.stack([prepared.before for prepared in pictures])
         return window.paste(window.develop(radiance, exposure, noise_sample), recorded_images)
@@ -267,7 +279,7 @@ def texturable_images(
         StoreError: The folder cannot be written to.
     """
     cache_folder = _cache_folder(folder, layers, split)
-    rows = image_rows(folder, split)
+    rows, sensor = image_rows(folder, split), recorded_sensor(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
     missing_views = recorded_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
@@ -280,7 +292,17 @@ def texturable_images(
         image = read_image(folder / "images" / file)
         corner = int(cached["corner"][0]), int(cached["corner"][1])
         exposure = float(cached["exposure"])
-        yield TexturableImage(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
+        radiance, fragments, noise = cached["radiance"], cached["fragments"], cached["noise"]
+        yield TexturableImage(file, row, objects, image, corner, radiance, exposure, fragments, sensor, noise)
+
+
+def recorded_sensor(folder: Path, split: str = "all") -> SensorModel:
+    """Return the sensor of a recording, with the effects of its lens.
+
+    Raises:
+        FormatError: The folder holds no recording of this version.
+    """
+    return with_lens_effects(SENSOR, recording_of(folder, split)["effects"])
 
 
 def uncached_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
@@ -332,14 +354,16 @@ def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], s
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def visible_part(picture: Rendering) -> dict[str, Any]:
-    """What is kept of one rendered picture: the part around what shows textures."""
+def visible_part(picture: Rendering, view: View) -> dict[str, Any]:
+    """What is kept of one rendered picture of a view: the part around what shows textures."""
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
     (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
     if with_lens_effects(SENSOR, picture.effects).scatters:
         # The lens carries light from everywhere to everywhere.
         (top, bottom), (left, right) = (0, height), (0, width)
+    noise = view_noise(view)
+    assert noise is not None
     fragments = picture.fragments.copy()
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
@@ -347,11 +371,13 @@ def visible_part(picture: Rendering) -> dict[str, Any]:
         "radiance": picture.radiance[0, top:bottom, left:right],
         "exposure": picture.exposure[0],
         "fragments": fragments,
+        "noise": noise[top:bottom, left:right],
     }
 
 
 def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return visible_part(render(view.scene, [view.with_layers(*layers)]))
+    dressed_view = view.with_layers(*layers)
+    return visible_part(render(view.scene, [dressed_view], quality=view.quality), dressed_view)
 
 
 def _span(places: Any, limit: int) -> tuple[int, int]:

@@ -144,27 +144,6 @@ def mix(
 
 
 @wp.kernel
-def take_lamps(
-    radiance: wp.array3d(dtype=wp.vec3),
-    material: wp.array3d(dtype=int),
-    gains: wp.array2d(dtype=float),
-    lamps: wp.array(dtype=float),
-    out: wp.array3d(dtype=wp.vec3),
-):
-    """Compute the light that lamps have beyond that of the image; gains: see `lamp_gains`; lamps [B]: 0 by day."""
-    view_index, row_index = wp.tid()
-    for column in range(out.shape[2]):
-        source = wp.vec3(0.0, 0.0, 0.0)
-        index = material[view_index, row_index, column]
-        if lamps[view_index] > 0.0 and index >= 0:
-            if gains[index, 0] > 0.0:
-                light = radiance[view_index, row_index, column]
-                if 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2] > gains[index, 1] * lamps[view_index]:
-                    source = light * (gains[index, 0] * lamps[view_index])
-        out[view_index, row_index, column] = source
-
-
-@wp.kernel
 def add_enlarged(scattered: wp.array3d(dtype=wp.vec3), lamps: wp.array(dtype=float), out: wp.array3d(dtype=wp.vec3)):
     """Add light of half the size to the views in which lamps are on."""
     view_index, row_index = wp.tid()

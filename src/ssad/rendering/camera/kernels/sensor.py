@@ -92,6 +92,14 @@ def filled(response: Response, light: float, normal: float) -> float:
 
 
 @wp.func
+def site_noise(seed: int, y: int, x: int, width: int) -> float:
+    """Return the noise of the photosite at y, x in standard deviations."""
+    # Seeded by the position: noise does not depend on the order of the threads.
+    state = wp.rand_init(seed, y * width + x)
+    return wp.randn(state)
+
+
+@wp.func
 def spread_row(
     radiance: wp.array3d(dtype=wp.vec3), b: int, y: int, left: int, x: int, right: int, c: int, response: Response
 ) -> float:
@@ -120,10 +128,15 @@ def site(
     )
     light = light * response.exposure[c]
     if response.dark > 0.0:
-        # Seeded by the position: noise does not depend on the order of the threads.
-        state = wp.rand_init(response.seed, y * radiance.shape[2] + x)
-        return filled(response, light, wp.randn(state))
+        return filled(response, light, site_noise(response.seed, y, x, radiance.shape[2]))
     return wp.min(light, response.full)
+
+
+@wp.kernel
+def draw_noise(seed: int, noise: wp.array2d(dtype=float)):
+    """Draw the noise [H, W] that `expose` gives a view with this seed, in standard deviations."""
+    y, x = wp.tid()
+    noise[y, x] = site_noise(seed, y, x, noise.shape[1])
 
 
 @wp.kernel

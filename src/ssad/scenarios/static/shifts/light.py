@@ -11,23 +11,21 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ssad.core.colours import linear_to_srgb, srgb_to_linear
 from ssad.core.types import F64, U8
 from ssad.scenarios.static.shifts.kernels.light import CODES, FULL
 
 
 def to_linear(codes: Any) -> F64:
     """Return the linear light, 1 for white, of sRGB codes in 0..255."""
-    share = np.asarray(codes, np.float64) / 255
-    # Clamped, since `where` evaluates both branches.
-    return np.where(share <= 0.04045, share / 12.92, ((np.maximum(share, 0.04045) + 0.055) / 1.055) ** 2.4)
+    light: F64 = srgb_to_linear(np.asarray(codes, np.float64) / 255)
+    return light
 
 
 def to_codes(light: Any) -> F64:
     """Return linear light in 0..1 as sRGB codes in 0..255, not rounded."""
-    linear = np.asarray(light, np.float64)
-    return 255 * np.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    )
+    codes: F64 = 255 * linear_to_srgb(np.asarray(light, np.float64))
+    return codes
 
 
 def code_table() -> U8:

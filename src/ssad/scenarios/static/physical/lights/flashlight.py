@@ -10,6 +10,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.schema import VALUES, Least, Number, Part, Span
 from ssad.core.types import F64
 from ssad.rendering.camera.lamps import SceneLamp
@@ -93,7 +94,8 @@ class Flashlight:
 
     def power(self, values: Mapping[str, float]) -> float:
         """Return the luminous flux behind the filter, lumen."""
-        return values["lumens"] * (0.2126 * values["red"] + 0.7152 * values["green"] + 0.0722 * values["blue"])
+        red, green, blue = LUMINANCE
+        return values["lumens"] * (red * values["red"] + green * values["green"] + blue * values["blue"])
 
 
 _IDENTITY: F64 = first_array(torch.eye(4, dtype=torch.float64)[None])

@@ -17,7 +17,7 @@ from torch import Tensor
 from ssad.core.types import F64
 from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.photometry import per_lux
-from ssad.rendering.camera.render import View, render, scene_light
+from ssad.rendering.camera.render import RenderQuality, View, render, scene_light, view_noise
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
 from ssad.rendering.camera.sensor import SensorModel
@@ -44,6 +44,7 @@ class LitImage:
         per_lux: Irradiance over pi of one lux (see `ssad.rendering.camera.photometry`).
         fog: Extinction, 1/m.
         sensor: Sensor of the camera.
+        noise: Noise of the photosites of the crop in standard deviations [1, h, w]; None if there is none.
     """
 
     before: Tensor
@@ -58,6 +59,7 @@ class LitImage:
     per_lux: float
     fog: float
     sensor: SensorModel
+    noise: Tensor | None = None
 
     def show(self, change: Tensor) -> Tensor:
         """Return images with more or less light in the crop around the target.
@@ -68,7 +70,8 @@ class LitImage:
         Returns:
             [N, 3, H, W] in 0 to 1, differentiable in the change.
         """
-        crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
+        noise = None if self.noise is None else self.noise.expand(len(change), -1, -1)
+        crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor, noise)
         (top, left), (height, width) = self.corner, self.radiance.shape[:2]
         is_whole = (height, width) == self.before.shape[2:]
         # At the border of the part the lens lacks what lies beyond it.
@@ -89,6 +92,7 @@ def render_lit_image(
     columns: slice,
     *,
     blind: int,
+    quality: RenderQuality,
     device: str | torch.device = "cpu",
 ) -> LitImage:
     """Render a view once, as a function of the light on a target.
@@ -100,9 +104,10 @@ def render_lit_image(
         rows: Rows of the crop around the target; its first row and column are even.
         columns: See `rows`.
         blind: Index of the body of `BLIND` in the scene.
+        quality: Quality of the rendering.
         device: Device of the images.
     """
-    rendering = render(scene, [view], surface=True)
+    rendering = render(scene, [view], quality=quality, surface=True)
     sensor = with_lens_effects(view.sensor, rendering.effects)
     if sensor.scatters:
         # The lens carries light from everywhere to everywhere.
@@ -114,9 +119,12 @@ def render_lit_image(
     # Two renderings, with and without the sun on the target, give the sun's share.
     shaded = rendering.radiance
     if sun[2] > 0.0:
-        shaded = render(scene, [SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))]).radiance
+        shaded_view = SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))
+        shaded = render(scene, [shaded_view], quality=quality).radiance
     irradiance = surface.irradiance[crop]
     surface_gain = np.where(irradiance > 0.0, surface.gain[crop] / np.maximum(irradiance, 1e-12), 0.0)
+
+    noise = view_noise(view)
 
     def on_device(array: Any) -> Tensor:
         return torch.from_numpy(np.array(array, np.float32)).to(device)
@@ -134,4 +142,5 @@ def render_lit_image(
         per_lux(view.weather),
         view.weather.fog,
         sensor,
+        None if noise is None else on_device(noise[rows, columns])[None],
     )

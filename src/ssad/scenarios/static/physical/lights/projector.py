@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.schema import VALUES, Least, Number, Two, build_validated
 from ssad.rendering.camera.lamps import SceneLamp
@@ -92,8 +93,7 @@ class Projector:
     def power(self, colour: Tensor) -> float:
         """Return the luminous flux of an image, lumen."""
         share = self.light_of(colour).mean((1, 2)).double()
-        # Luminance weights of linear sRGB.
-        return float(self.lumens * (share @ share.new_tensor([0.2126, 0.7152, 0.0722])))
+        return float(self.lumens * (share @ share.new_tensor(LUMINANCE)))
 
     def training(self, /, **settings: Any) -> TextureAttack:
         """Return the settings of the training: no terms for print, and an aim with small errors.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import torch
 
+from ssad.core.colours import LUMINANCE
 from ssad.core.driving import Frames, Generators
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
@@ -25,7 +26,6 @@ from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Episode
 from ssad.datasets.nuscenes.files import read_frame_image
 from ssad.datasets.nuscenes.scene import SensorFrame
-from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.photometry import illuminance
 from ssad.rendering.hours import SUN
 from ssad.rendering.street_edit import route_pose
@@ -230,7 +230,7 @@ class LensLight(Perturbation):
         luminance = self.scatter * GLARE * self.lux(distance) / (angle_degrees * angle_degrees + CORE * CORE)
         # Colours share the luminance: a saturated colour fills its channel sooner.
         source_colour = np.array(COLOURS[self.source])
-        colour_luminance = float(source_colour @ TO_LUMINANCE)
+        colour_luminance = float(source_colour @ LUMINANCE)
         return np.asarray((luminance / scale)[..., None] * source_colour / colour_luminance, np.float32)
 
 

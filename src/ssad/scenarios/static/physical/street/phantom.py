@@ -23,9 +23,10 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, Episode
 from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.effects import NO_EFFECTS
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.photometry import illuminance
-from ssad.rendering.camera.render import SceneWeather, View, render
+from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import HOURS, SUN, at_hour
@@ -245,7 +246,8 @@ def _picture_light(picture: str) -> Tensor:
     picture_view = View(
         picture_camera, camera_pose, (SceneObject(0, np.eye(4), (0.45, 0.1, 0.08), 1),), SceneWeather(0.9, 0.0, 0.3)
     )
-    rendering = render(body_scene, [picture_view])
+    # A slide shows the body alone: air and lens add their light when the picture of the street is taken.
+    rendering = render(body_scene, [picture_view], quality=RenderQuality(effects=NO_EFFECTS))
     linear_image = decode_srgb(np.asarray(rendering.image[0]))
     shown_light: F32 = np.where((np.asarray(rendering.tag[0]) == 1)[..., None], linear_image, 0.0).astype(np.float32)
     peak_light = (

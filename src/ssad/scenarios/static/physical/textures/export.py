@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from ssad.core import safeio
+from ssad.core.colours import linear_to_srgb
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.types import U8
 from ssad.rendering.agent_edit import AgentEdit
@@ -187,11 +188,8 @@ def _atlas(texels: Any, surface: TextureSurface, target: Target) -> U8:
     u0, v0, u1, v1 = _rectangle(surface)
     if (u0, v0, u1, v1) == (0.0, 0.0, 1.0, 1.0):
         return _resized(texels, (max(ATLAS, texels.shape[0]), max(ATLAS, texels.shape[1])))
-    paint = np.asarray(target.colour)
-    # The transfer function of sRGB (IEC 61966-2-1).
-    srgb = np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055)
     atlas = np.empty((ATLAS, ATLAS, 3), np.uint8)
-    atlas[:] = (srgb * 255).round()
+    atlas[:] = (linear_to_srgb(np.asarray(target.colour)) * 255).round()
     left, top, right, bottom = (round(edge * ATLAS) for edge in (u0, v0, u1, v1))
     if right > left and bottom > top:  # else smaller than a texel
         atlas[top:bottom, left:right] = _resized(texels, (bottom - top, right - left))

@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from ssad.core.boxes import camera_axes
+from ssad.core.colours import LUMINANCE
 from ssad.core.errors import ConfigError
 from ssad.core.images import encode_srgb
 from ssad.core.types import F32, F64, U8, Bool
-from ssad.rendering.camera.lamps import TO_LUMINANCE
 from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.meshes.mesh import Mesh
@@ -188,7 +188,7 @@ def light_on(image: U8, box: F64) -> F32:
     upper_corner = np.clip(np.ceil(centre + sides).astype(int), lower_corner + 1, (pixel_width, pixel_height))
     mean = _linear(image[lower_corner[1] : upper_corner[1], lower_corner[0] : upper_corner[0]]).reshape(-1, 3).mean(0)
     # Brightness alone: the colours of few objects say little about the colour of the light.
-    return np.full(3, mean @ TO_LUMINANCE / GREY_WORLD, np.float32)
+    return np.full(3, mean @ LUMINANCE / GREY_WORLD, np.float32)
 
 
 def _linear(image: U8) -> F32:
