@@ -79,7 +79,7 @@ def blob(
     rough: float = 0.14,
     key: str = "",
 ) -> TrianglePiece:
-    """An uneven ellipsoid of 20 triangles, shaded smooth; with a `key`, its form takes no draw from the town's generator."""
+    """An uneven ellipsoid of 20 triangles, shaded smooth; one with a `key` takes no draw of the town."""
     rng = generator(key, *centre.tolist(), *radius.tolist()) if key else materials.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
