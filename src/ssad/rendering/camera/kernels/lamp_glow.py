@@ -32,7 +32,7 @@ def take_lamps(
     light = lights[view]
     share = 1.0 / float(scale * scale)
     # Neighbours mostly show the same surface: what is no lamp is looked up once.
-    dark_key = wp.uint64(0)
+    dark_key = wp.uint64(NONE)
     for x in range(lane, out.shape[2], lanes):
         total = wp.vec3(0.0, 0.0, 0.0)
         if is_glowing[view] == 1 and light.lamps > 0.0:
