@@ -3,7 +3,7 @@
 import warp as wp
 
 from ssad.rendering.camera.kernels.light import lamp_emission
-from ssad.rendering.camera.kernels.raster import LAST
+from ssad.rendering.camera.kernels.raster import LAST, NONE
 from ssad.rendering.camera.kernels.shade import DrawRanges, Geometry, hit_of
 from ssad.rendering.camera.kernels.sky import Light, air_transmission
 
