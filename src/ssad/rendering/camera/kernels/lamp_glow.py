@@ -40,7 +40,7 @@ def take_lamps(
                 row = y * scale + sample / scale
                 column = x * scale + sample % scale
                 key = draw_samples.samples[view, row, column] & LAST
-                if key != dark_key:
+                if key != NONE and key != dark_key:
                     slot = int(LAST - key)
                     owner = draw_samples.owners[slot / 2]
                     gain = gains[geometry.material[owner[1]]]
