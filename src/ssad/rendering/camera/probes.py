@@ -34,6 +34,7 @@ REACH = (20.0, 70.0)  # m up to which the street is drawn in full, and without s
 FAR, FAR_UP = 300.0, 60.0  # m up to which it is drawn at all, to the sides and upwards
 SUN_SIZE, SUN_REACH = 512, 60.0  # texels and m of the shadow map of a probe
 PROBES_IN_MEMORY, VIEWS_IN_MEMORY = 48, 12  # of each scene
+MOST_PROBES = 512  # in memory, where more cameras than `PROBES_IN_MEMORY` take turns
 
 
 @dataclass(slots=True)
@@ -43,10 +44,24 @@ class ProbeStore:
     Attributes:
         texels: Lit probes by place and light.
         views: Visibility passes by place.
+        dropped: Keys of the probes that were dropped last.
+        capacity: Number of probes that are kept.
     """
 
     texels: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
     views: OrderedDict[Any, VisibilityPass] = field(default_factory=OrderedDict)
+    dropped: OrderedDict[Any, None] = field(default_factory=OrderedDict)
+    capacity: int = PROBES_IN_MEMORY
+
+    def keep_texels(self, key: Any, texels: Any) -> None:
+        """Keep a probe, and drop the one whose last use is longest ago if there are too many."""
+        if key in self.dropped:
+            # A probe that is wanted again soon after it was dropped shows that many cameras take turns.
+            del self.dropped[key]
+            self.capacity = min(self.capacity + 1, MOST_PROBES)
+        self.texels[key] = texels
+        while len(self.texels) > self.capacity:
+            _keep(self.dropped, self.texels.popitem(last=False)[0], None, self.capacity)
 
 
 def no_probes(scene: RenderScene) -> Any:
@@ -92,7 +107,7 @@ def gather_probes(
                     _keep(store.views, place, visible, VIEWS_IN_MEMORY)
                 lit_texels = _light_probe(scene, view, light, centre, visible, shadows=shadows, lamps=lamps)
             if scene.street is not None:
-                _keep(store.texels, key, lit_texels, PROBES_IN_MEMORY)
+                store.keep_texels(key, lit_texels)
             texels.append(lit_texels)
             centres.append(centre)
         rows.append(known_rows[key])

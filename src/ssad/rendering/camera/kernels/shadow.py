@@ -114,9 +114,9 @@ def soft_share(map: SunMap, view_index: int, p: wp.vec3, n: wp.vec3) -> float:
         for dx in range(-search, search + 1, 2):
             plane = across - (float(column + dx) - x) * slope_x * 1.0e-3
             depth = depth_of(map.keys, view_index, row_index + dy, column + dx)
-            if depth > plane:
-                gap += depth - plane
-                count += 1
+            # Sums without branches: which texels occlude is hard to predict.
+            gap += wp.max(depth - plane, 0.0)
+            count += wp.where(depth > plane, 1, 0)
     if count == 0:
         return 1.0
     if count == (search + 1) * (search + 1):
@@ -131,11 +131,10 @@ def soft_share(map: SunMap, view_index: int, p: wp.vec3, n: wp.vec3) -> float:
         across = own_depth - v * slope_y * 1.0e-3
         for dx in range(-reach, reach + 1):
             u = float(column + dx) - x
-            weight = 1.0 - (u * u + v * v) * inverse
-            if weight > 0.0:
-                weight_sum += weight
-                if depth_of(map.keys, view_index, row_index + dy, column + dx) <= across - u * slope_x * 1.0e-3:
-                    open_weight += weight
+            weight = wp.max(1.0 - (u * u + v * v) * inverse, 0.0)
+            weight_sum += weight
+            depth = depth_of(map.keys, view_index, row_index + dy, column + dx)
+            open_weight += wp.where(depth <= across - u * slope_x * 1.0e-3, weight, 0.0)
     return open_weight / weight_sum
 
 
