@@ -88,6 +88,6 @@ def test_what_inks_cannot_print_or_hides_no_more_than_a_control_does_not_ship(
     assert share_outside(texture) == 0.0
     assert "5 to 80 m behind" in card.data
     messages = capsys.readouterr().out
-    assert "DAS in Oldmarket cannot be printed (37.0% of its texels outside the gamut of the inks): left out" in messages
+    assert "DAS in Oldmarket cannot be printed (37.0% of its texels outside the gamut of the inks)" in messages
     assert "TPA in Oldmarket cannot be printed" in messages
     assert "Adv. Patch in Oldmarket is not stronger than the controls: left out" in messages
