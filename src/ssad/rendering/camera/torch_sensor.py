@@ -104,7 +104,7 @@ def _to_squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
     return pixel_shuffle(conv2d(padded, weights, stride=2), 2)[:, :, :height, :width]
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=192)  # parts of images have many sizes, and copies to a GPU take long
 def _halving_matrices(size: int, levels: int, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
     """Return the matrices [n, m] of an axis from each level of the pyramid to the next."""
     matrices = []
