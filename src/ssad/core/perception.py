@@ -144,6 +144,8 @@ class DrivePerception:
         cameras: Its cameras.
         signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
         lanes: For each step of a lane keeper its time, s, and the lane; None before it has detected one.
+        limits: For each step of a driver that reads speed limits its time, s, and the limit of the last sign that it
+            has read, km/h; None before the first.
     """
 
     detections: Sequence[tuple[float, Objects | None]]
@@ -151,3 +153,4 @@ class DrivePerception:
     cameras: Mapping[str, Camera]
     signs: Sequence[tuple[float, F64]] = ()
     lanes: Sequence[tuple[float, PerceivedLane | None]] = ()
+    limits: Sequence[tuple[float, int | None]] = ()

@@ -24,7 +24,7 @@ from ssad.rendering.meshes.mesh import Mesh, merge
 from ssad.rendering.scene_objects import PHASES, STRIDE, GroundOccupancy
 from ssad.rendering.signal_heads import SignalHeads, head_meshes
 from ssad.rendering.street import cached_street
-from ssad.rendering.street_signs import KINDS, REACH, street_signs
+from ssad.rendering.street_signs import KINDS, LIMIT_SIGN, REACH, street_signs
 from ssad.rendering.vehicle_signals import flashing, trace_signals
 from ssad.world.models import agent_model, agent_size, stated_size, trace_sizes
 from ssad.world.rollout import route_signals
@@ -154,8 +154,10 @@ class EpisodeScene:
             )
         )
         self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
-        self.sign_kinds = {index: sign.kind for index, sign in enumerate(signs)}
-        self.sign_styles = {index: sign.style for index, sign in enumerate(signs)}
+        self.sign_kinds = {
+            index: f"{sign.kind}:{sign.style}" if sign.kind == LIMIT_SIGN else sign.kind
+            for index, sign in enumerate(signs)
+        }
         self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
         # Signs and lenses come first: their numbers must not change when bodies are added.
         self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + list(head_meshes())

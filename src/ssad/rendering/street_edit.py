@@ -32,8 +32,8 @@ class StreetEdit:
         edit: Decals and lamps in the frame of the place: x along the route, y to the left, z up; powers in lumen.
         place: Distance along the route and offset to the left of it, m.
         bodies: Bodies with their poses [4, 4] in the frame of the place.
-        signs: Kind of the town's signs (`ssad.rendering.street_signs.KINDS`) -> body that stands in place of each of
-            them; None removes them.
+        signs: Kind of the town's signs (stop_sign, yield_sign or limit_sign, or "limit_sign:30" for those of 30 km/h)
+            -> body that stands in place of each of them; None removes them.
         head_lamps: Lamps that shine on every signal head, in its frame (x away from its face); powers in lumen.
 
     Raises:
@@ -77,15 +77,17 @@ class StreetEdit:
             scene_objects: Objects of the view.
             route: Route of the episode [N, 2].
             index: Number in the scene of each of `meshes`.
-            sign_kinds: Number of the mesh of each of the town's signs -> its kind.
+            sign_kinds: Number of the mesh of each of the town's signs -> its kind, with the figures of a limit.
         """
         changed = []
         for scene_object in scene_objects:
             kind = sign_kinds.get(scene_object.mesh) if scene_object.tag == 0 else None
-            if kind is None or kind not in self.signs:
+            names = () if kind is None else (kind, kind.partition(":")[0])
+            name = next((name for name in names if name in self.signs), None)
+            if name is None:
                 changed.append(scene_object)
-            elif self.signs[kind] is not None:
-                changed.append(replace(scene_object, mesh=index["street edit sign", id(self), kind]))
+            elif self.signs[name] is not None:
+                changed.append(replace(scene_object, mesh=index["street edit sign", id(self), name]))
         place = self.pose(route) if self.bodies else np.eye(4)
         changed += [
             SceneObject(index["street edit", id(self), number], place @ pose)

@@ -25,6 +25,7 @@ ROOM: Final = 0.5  # m, side of the square that a post takes
 SPACING: Final = 16.0  # m between places along a kerb where a further sign may stand
 SHARE: Final = 0.7  # of these places have one
 YIELDS: Final = 0.2  # share of yield signs among them
+FACING: Final = 0.7  # least cosine between the traffic that a speed-limit sign faces and the route beside it
 ASKEW: Final = 0.06  # rad, standard deviation: posts are turned by hand
 
 
@@ -103,6 +104,30 @@ def free_places(
         spot = _free_place(x, y, yaw, occupancy)
         if spot is not None:
             yield (*spot, yaw + np.pi, z)
+
+
+def limit_signs_of_route(limit_signs: F32, route: F64, *, within: float) -> F64:
+    """Return the speed-limit signs that face the traffic of a route, in its order.
+
+    Args:
+        limit_signs: Speed-limit signs of a street [L, 5], see `ssad.rendering.street.model.Street`.
+        route: Points [N, 2], m.
+        within: Greatest distance from the route, m.
+
+    Returns:
+        Distance along the route, m, and limit, km/h, of each sign [M, 2].
+    """
+    rows, steps = limit_signs.astype(np.float64), np.diff(route, axis=0)
+    if not len(rows) or not len(steps):
+        return np.zeros((0, 2))
+    arc_lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
+    distances = np.hypot(*np.moveaxis(rows[:, None, :2] - route[None, :-1], -1, 0))
+    nearest = distances.argmin(1)
+    headings = steps[nearest] / np.maximum(np.hypot(*steps[nearest].T), 1e-9)[:, None]
+    facing = np.cos(rows[:, 2]) * headings[:, 0] + np.sin(rows[:, 2]) * headings[:, 1] > FACING
+    chosen = np.flatnonzero(facing & (distances.min(1) < within))
+    signs = np.stack([arc_lengths[nearest[chosen]], rows[chosen, 4]], 1)
+    return np.asarray(signs[np.argsort(signs[:, 0], kind="stable")])
 
 
 def plate_and_post(mesh: Mesh) -> tuple[Mesh, Mesh]:

@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, AgentKind, Episode
-from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver, PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.driver import PerceivedEvent, PerceivingDriver, PerceptionEvent
 from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restore_part, snapshot_part
 from ssad.drivers.perceiving.perceivers import PerfectPerceiver
 from ssad.drivers.perceiving.sensors import sensors_of
@@ -210,7 +210,7 @@ def _make_loop(
     """Return a loop in which a perceiver looks at every step, its driver, and the record of its looks by scene."""
     looks: list[list[bytes | None]] = [[] for _ in range(world.batch)]
 
-    def watch(event: PerceptionEvent | TrackingEvent | LaneEvent) -> None:
+    def watch(event: PerceivedEvent) -> None:
         if isinstance(event, PerceptionEvent):
             objects = event.objects
             # Without the index of the scene, which depends on the batch.

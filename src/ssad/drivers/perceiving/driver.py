@@ -100,6 +100,25 @@ class LaneEvent:
     image: U8
 
 
+@dataclass(frozen=True, eq=False)
+class LimitEvent:
+    """Speed limit that a lane keeper has read at a step, for observers.
+
+    Attributes:
+        scene: Index of the scene.
+        time: s.
+        limit: Limit of the last sign that it has read, km/h; None before the first.
+    """
+
+    scene: int
+    time: float
+    limit: int | None
+
+
+PerceivedEvent = PerceptionEvent | TrackingEvent | LaneEvent | LimitEvent
+"""Event that a perceiving driver reports to an observer."""
+
+
 class PerceivingDriver:
     """Driver that perceives: by default the Autopilot on the belief of a perceiver.
 
@@ -136,7 +155,7 @@ class PerceivingDriver:
         tracking: TrackerSettings | None = None,
         rate: float = 5.0,
         latency: float = 0.1,
-        watch: Callable[[PerceptionEvent | TrackingEvent | LaneEvent], None] | None = None,
+        watch: Callable[[PerceivedEvent], None] | None = None,
         repair: RepairedAgents | None = None,
         signs: SignReading | None = None,
     ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.perception import DrivePerception, PerceivedLane
 from ssad.core.types import F64, U8
-from ssad.drivers.perceiving.driver import LaneEvent, PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.driver import LaneEvent, LimitEvent, PerceivedEvent, PerceptionEvent
 
 
 class PerceptionRecorder:
@@ -29,9 +29,13 @@ class PerceptionRecorder:
         self._shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
         self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
         self.lanes: list[list[tuple[float, PerceivedLane | None]]] = [[] for _ in range(scenes)]
+        self.limits: list[list[tuple[float, int | None]]] = [[] for _ in range(scenes)]
 
-    def __call__(self, event: PerceptionEvent | TrackingEvent | LaneEvent) -> None:
+    def __call__(self, event: PerceivedEvent) -> None:
         """See `PerceivingDriver`."""
+        if isinstance(event, LimitEvent):
+            self.limits[event.scene].append((event.time, event.limit))
+            return
         if isinstance(event, LaneEvent):
             self.lanes[event.scene].append((event.time, event.lane))
             if self.every is not None:
@@ -70,7 +74,14 @@ class PerceptionRecorder:
 
     def perception(self, scene: int) -> DrivePerception:
         """Return the perception in a scene."""
-        return DrivePerception(self.looks[scene], self.known[scene], self.cameras, self.signs[scene], self.lanes[scene])
+        return DrivePerception(
+            self.looks[scene],
+            self.known[scene],
+            self.cameras,
+            self.signs[scene],
+            self.lanes[scene],
+            self.limits[scene],
+        )
 
 
 def _channels_last(picture: Any) -> U8:

@@ -17,7 +17,7 @@ from ssad.core.schema import Schema
 from ssad.core.source import plugin_version
 from ssad.detectors import DETECTORS
 from ssad.drivers.lane_keeping.driver import CHANNEL, LaneKeeper
-from ssad.drivers.perceiving.driver import LaneEvent, PerceivingDriver, PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.driver import PerceivedEvent, PerceivingDriver
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     cameras_of,
@@ -82,6 +82,8 @@ class PerceivingSystem(Schema):
         planner: planner in place of the Autopilot's (`ssad list planners`).
         steers_by: route: it follows its given route; markings: a lane keeper, which steers by the lane markings that it
             detects in its front camera (`ssad.drivers.lane_keeping`), and stops where it loses them.
+        set_speed: of a lane keeper that reads speed-limit signs in its front camera, m/s: it drives at the limit of
+            the last sign that it has read, and at this speed before the first; none: the speed limit is given to it.
     """
 
     name: str = Field(min_length=1)
@@ -106,13 +108,18 @@ class PerceivingSystem(Schema):
     tracker: Part | None = None
     planner: Part | None = None
     steers_by: Literal["route", "markings"] = ROUTE
+    set_speed: float | None = Field(default=None, gt=0, le=70, allow_inf_nan=False)
 
     @model_serializer(mode="wrap")
     def _without_unnamed_parts(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave parts out that are not named: the dump enters the keys of cells, which must not change by them."""
         values: dict[str, Any] = dump(self)
         values = {key: value for key, value in values.items() if key not in NAMED or value is not None}
-        return {key: value for key, value in values.items() if (key, value) != ("steers_by", ROUTE)}
+        return {
+            key: value
+            for key, value in values.items()
+            if (key, value) not in (("steers_by", ROUTE), ("set_speed", None))
+        }
 
     @property
     def version(self) -> str:
@@ -179,6 +186,8 @@ class PerceivingSystem(Schema):
             raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
         if self.keeps_lane and self.planner is not None:
             raise ConfigError(f"system {self.name}: steers_by: markings has no planner; remove the key planner")
+        if self.set_speed is not None and not self.keeps_lane:
+            raise ConfigError(f"system {self.name}: set_speed can only be used with steers_by: markings")
         if self.sign_memory is not None and not self.reads_signs:
             raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
         for kind, keys in (("perceiver", KEYS_OF_PERCEIVER), ("tracker", KEYS_OF_TRACKER)):
@@ -206,7 +215,7 @@ class PerceivingSystem(Schema):
 
     def make(
         self,
-        watch: Callable[[PerceptionEvent | TrackingEvent | LaneEvent], None] | None = None,
+        watch: Callable[[PerceivedEvent], None] | None = None,
         *,
         repair: RepairedAgents | None = None,
         device: str = "cpu",
@@ -232,6 +241,7 @@ class PerceivingSystem(Schema):
         planner: dict[str, Any] = {"planner": None if self.planner is None else self._make_part("planner")}
         if self.keeps_lane:
             make_driver, planner = LaneKeeper, {"camera": nuscenes_cameras(self.width)[CHANNEL]}
+            planner |= {"set_speed": self.set_speed}
         driver = make_driver(
             self._make_perceiver(device),
             tracker=None if built_in else self._make_part("tracker"),

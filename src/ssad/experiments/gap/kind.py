@@ -11,15 +11,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.folders import path_inside
 from ssad.core.images import save_picture
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
 from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.core.traces import first_difference, load_trace
+from ssad.core.types import EpisodeTrace
 from ssad.drivers.lane_keeping.markings import RoadGrid
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
@@ -46,6 +49,9 @@ from ssad.metrics.perception_in_drive import (
     phantom_stop,
     sign_metrics,
 )
+from ssad.metrics.speed_limits import limit_metrics
+from ssad.rendering.street import cached_street
+from ssad.rendering.street_signs import limit_signs_of_route
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable
@@ -54,6 +60,7 @@ from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
 from ssad.simulators.closed_loop import build_requested_episode, cached_town, system_version
 
 VIEW_AHEAD = RoadGrid().far  # m: range of the lane keeper
+BESIDE_LANE = 12.0  # m from the route within which a speed-limit sign belongs to it
 FRAME_INTERVAL = 0.2  # s from one frame of a film to the next
 
 
@@ -130,6 +137,12 @@ class Gap(ScenarioKind):
         Column("departure_time", "time to the departure from the lane", "s", "higher", limits=NOT_NEGATIVE),
         Column("lane_error", "error of the detected middle of the lane", "m", "lower", limits=NOT_NEGATIVE),
         Column("lane_detection_rate", "share of the steps in which the lane was detected", "", "higher", limits=SHARE),
+        Column(
+            "limit_known", "share of the steps behind a sign with the right speed limit", "", "higher", limits=SHARE
+        ),
+        Column("limit_error", "error of the speed limit that was read", "km/h", "lower", limits=NOT_NEGATIVE),
+        Column("speeding", "speed above the posted limit", "km/h", "lower", limits=NOT_NEGATIVE),
+        Column("speeding_max", "greatest speed above it", "km/h", "lower", limits=NOT_NEGATIVE),
     )
     factors = ("system", "perturbation", "severity")
     metric_limits = LIMITS
@@ -238,6 +251,10 @@ class Gap(ScenarioKind):
                     place = getattr(perturbation_of(cell.spec), "place_distance", None)
                     graph = cached_town(trace.town)
                     metrics |= lane_metrics(trace, graph, perceived.lanes, place=place, view=VIEW_AHEAD)
+                    if system.set_speed is not None:
+                        metrics |= limit_metrics(
+                            trace, graph, perceived.limits, first_sign=first_limit_sign(trace, graph)
+                        )
                     metrics |= {
                         name: None for name, value in metrics.items() if value is not None and math.isnan(value)
                     }
@@ -354,3 +371,11 @@ def conditions_of(suite: GapSuite) -> list[Condition]:
         if not system.is_perfect:
             conditions += [Condition(system, perturbation, entry) for perturbation, entry in perturbations]
     return conditions
+
+
+def first_limit_sign(trace: EpisodeTrace, graph: LaneGraph) -> float | None:
+    """Return the distance along the route of a drive to its first speed-limit sign, m; None without one."""
+    signs = limit_signs_of_route(
+        cached_street(graph).limit_signs, trace.route[:, :2].astype(np.float64), within=BESIDE_LANE
+    )
+    return float(signs[0, 0]) if len(signs) else None

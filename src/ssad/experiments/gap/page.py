@@ -64,11 +64,17 @@ LANES = {
     "lane_error": "error of the camera, m",
     "lane_detection_rate": "lane detected",
 }
+LIMITS = {
+    "limit_known": "limit known",
+    "limit_error": "error of the limit, km/h",
+    "speeding": "above the limit, km/h",
+    "speeding_max": "at most, km/h",
+}
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
 BOUNDED = (
     *("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40"),
-    *("lane_departure", "lane_detection_rate"),
+    *("lane_departure", "lane_detection_rate", "limit_known"),
 )
 CONDITION = {
     "System": field("system"),
@@ -102,8 +108,8 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
     """Return the page and its tables."""
     main, drop, rank, cause = (build_table(run) for build_table in (main_table, drop_table, rank_table, cause_table))
     ceilings, errors, signs = (build_table(run) for build_table in (ceiling_table, error_table, sign_table))
-    lanes = lane_table(run)
-    tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs, lanes) if table.rows)]
+    lanes, limits = lane_table(run), limit_table(run)
+    tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs, lanes, limits) if table.rows)]
     failures = [
         ([line["system"], line["perturbation"], str(line["severity"]), scenario_of(line)], line["reason"])
         for line in run.failures
@@ -120,6 +126,7 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
         cause=cause,
         signs=signs,
         lanes=lanes,
+        limits=limits,
         courses=lane_courses(run),
         plot=scatter(run),
         failures=failures,
@@ -311,6 +318,22 @@ def lane_table(run: Run) -> Table:
         "that is completed. A drive leaves the lane where the body crosses a line. After: time from when the cause "
         "comes into view, or from the start where there is none, over the drives that leave it. From the middle: mean "
         "distance to it. Error of the camera: of the middle of the lane beside the ego, as the lane keeper found it.",
+    )
+
+
+def limit_table(run: Run) -> Table:
+    """Return the metrics of reading speed limits, a row for each condition."""
+    return Table.pivot(
+        "limits",
+        "Speed limits that are read",
+        run.lines,
+        rows=CONDITION,
+        columns=LIMITS,
+        metric=_cell,
+        condition=lambda lines: not all(math.isnan(metric_of(line, "limit_known")) for line in lines),
+        note="Behind the first speed-limit sign of the route. Known: share of the steps in which the limit of the last "
+        "sign that was read is the posted one. Error: mean difference of the two; steps without a reading do not "
+        "count. Above the limit: mean speed above the posted limit from 4 s after the sign on; slower speeds are 0.",
     )
 
 

@@ -1,0 +1,206 @@
+"""Speed-limit signs read from the pixels of a front camera.
+
+    image -> red mask -> round holes in it -> square of the plate -> correlation with the figures of each limit -> limit
+
+A plate (C 14 of the Vienna convention) is a bright disc that red surrounds, so it is a round hole in the mask of red
+pixels, also in front of a red wall. Figures are compared by normalised cross-correlation with drawings of the figures
+at the size of the plate in the image, which is invariant to brightness and contrast. Location by colour and shape with
+figures by template is the classical design of de la Escalera et al. (1997). The reader gets neither the map nor any
+places of signs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import cv2
+import numpy as np
+
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.types import F32, F64, U8
+from ssad.rendering.bodies.figures import number_strokes
+
+LIMITS: Final = tuple(range(10, 150, 10))  # km/h
+WHITE: Final = 0.76  # radius of the white disc, as a share of that of the plate
+PLATE: Final = 0.62  # m, diameter that tells the distance of a plate
+CELLS: Final = 28  # side of the square in which figures are compared
+ZOOM: Final = 2  # the upper half of an image is enlarged before plates are located
+SMOOTH: Final = 1.2  # pixels of the enlarged image, before red is told
+MIN_PIXELS: Final = 11.0  # least diameter of a plate in the image
+REDNESS: Final = (0.41, 0.46, 0.52)  # thresholds of R / (R + G + B), tried in turn
+FORM: Final = (0.72, 1.39)  # width by height of a hole
+ROUNDNESS: Final = 0.68  # least share of its box that a hole covers; a disc has 0.79
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitReading:
+    """Settings of reading speed-limit signs.
+
+    Attributes:
+        confirm: Number of readings of a sign that confirm it.
+        score: Minimum correlation of a reading.
+        margin: Minimum lead of a limit over the next one in the sum of the correlations of a sign, as a share of it.
+    """
+
+    confirm: int = 3
+    score: float = 0.6
+    margin: float = 0.03
+
+    def __post_init__(self) -> None:
+        if self.confirm < 1 or not 0.0 < self.score < 1.0 or not 0.0 <= self.margin < 1.0:
+            raise ConfigError(
+                "reading speed limits needs confirm >= 1, a score between 0 and 1 and a margin of 0 to 1, not "
+                f"{self.confirm}, {self.score:g} and {self.margin:g}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """Plate in an image.
+
+    Attributes:
+        centre: Column and row of its middle, pixels.
+        diameter: Pixels.
+        correlations: Correlation with the figures of each of `LIMITS`.
+    """
+
+    centre: tuple[float, float]
+    diameter: float
+    correlations: F64
+
+    @property
+    def limit(self) -> int:
+        """Limit with the highest correlation, km/h."""
+        return LIMITS[int(self.correlations.argmax())]
+
+    @property
+    def score(self) -> float:
+        """Correlation with the figures of that limit."""
+        return float(self.correlations.max())
+
+
+def find_plates(image: U8, camera: Camera) -> list[Plate]:
+    """Return the plates of speed-limit signs in an image.
+
+    Args:
+        image: uint8 [3, H, W], RGB.
+        camera: Its camera; plates stand above the horizon, on either side of the road.
+    """
+    rows = int(min(camera.intrinsic[1, 2] + 0.02 * camera.height, camera.height))
+    picture = np.ascontiguousarray(np.moveaxis(image[:, :rows], 0, -1))
+    enlarged = cv2.resize(picture, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    # The colour filter of the sensor breaks thin rings into dots.
+    smooth = cv2.GaussianBlur(enlarged, (0, 0), SMOOTH)
+    share = smooth[..., 0] / (smooth.sum(-1) + 1.0)
+    lead = smooth[..., 0] - np.maximum(smooth[..., 1], smooth[..., 2])
+    plates: list[Plate] = []
+    for threshold in REDNESS:
+        red = ((share > threshold) & (lead > 8.0)).astype(np.uint8)
+        for x, y, diameter in _round_holes(red):
+            if all(np.hypot(x - p.centre[0], y - p.centre[1]) > 0.5 * p.diameter for p in plates):
+                correlations = _compare(enlarged, x * ZOOM, y * ZOOM, diameter * ZOOM)
+                plates.append(Plate((x, y), diameter, correlations))
+    return plates
+
+
+def _round_holes(red: U8) -> list[tuple[float, float, float]]:
+    """Return x, y and the diameter of the plates, pixels of the image, whose white discs are holes of a red mask."""
+    contours, hierarchy = cv2.findContours(red, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    holes = []
+    for contour, (_, _, _, parent) in zip(contours, [] if hierarchy is None else hierarchy[0], strict=False):
+        x, y, width, height = cv2.boundingRect(contour)
+        # The contour of a hole runs on the red pixels around it.
+        width, height = width - 1, height - 1
+        diameter = 0.5 * (width + height) / WHITE / ZOOM
+        if parent < 0 or diameter < MIN_PIXELS or not FORM[0] < width / max(height, 1) < FORM[1]:
+            continue
+        if cv2.contourArea(contour) > ROUNDNESS * (width * height):
+            holes.append(((x + 0.5 * width) / ZOOM, (y + 0.5 * height) / ZOOM, diameter))
+    return holes
+
+
+def _compare(picture: F32, x: float, y: float, diameter: float) -> F64:
+    """Return the correlation of a plate with the figures of each limit; the best of nine places and three sizes."""
+    grey = picture.mean(-1)
+    best = np.full(len(LIMITS), -1.0)
+    for size in (0.94, 1.0, 1.06):
+        side = size * diameter * WHITE
+        templates, weights = _templates(min(round(side / ZOOM), 64))
+        for dx, dy in ((i, j) for i in (-0.04, 0.0, 0.04) for j in (-0.04, 0.0, 0.04)):
+            left, top = x + dx * diameter - 0.5 * side, y + dy * diameter - 0.5 * side
+            scale = side / CELLS
+            matrix = np.array([[scale, 0.0, left + 0.5 * scale - 0.5], [0.0, scale, top + 0.5 * scale - 0.5]])
+            square = cv2.warpAffine(
+                grey,
+                matrix,
+                (CELLS, CELLS),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+            values = square.astype(np.float64)[weights]
+            values -= values.mean()
+            best = np.maximum(best, templates @ values / max(float(np.linalg.norm(values)), 1e-6))
+    return np.asarray(best)
+
+
+@lru_cache(maxsize=64)
+def _templates(pixels: int) -> tuple[F64, F64]:
+    """Return the normalised figures [L, n] of a white disc of so many pixels, and the mask [CELLS, CELLS] of its n."""
+    fine = 280
+    axis = (np.arange(CELLS) + 0.5) / CELLS * 2.0 - 1.0
+    mask = np.hypot(*np.meshgrid(axis, axis)) < 0.9
+    rows = []
+    for limit in LIMITS:
+        drawing = np.full((fine, fine), 255, np.uint8)
+        for stroke in number_strokes(str(limit), segments=8):
+            points = 0.5 * fine * (1.0 + stroke / WHITE * [1.0, -1.0])
+            cv2.fillPoly(drawing, [np.round(points * 16.0).astype(np.int32)], 0, shift=4)
+        size = max(pixels, 6)
+        small = cv2.resize(drawing, (size, size), interpolation=cv2.INTER_AREA)
+        # The lens and the colour filter spread an edge over about a pixel.
+        small = cv2.GaussianBlur(small, (0, 0), 0.6)
+        square = cv2.resize(small, (CELLS, CELLS), interpolation=cv2.INTER_LINEAR).astype(np.float64)[mask]
+        square -= square.mean()
+        rows.append(square / np.linalg.norm(square))
+    return np.array(rows), np.asarray(mask)
+
+
+class LimitMemory:
+    """Limit that the signs of one drive have told so far.
+
+    Args:
+        settings: Settings.
+    """
+
+    def __init__(self, settings: LimitReading) -> None:
+        self.settings = settings
+        self.limit: int | None = None
+        self._place: F64 | None = None
+        self._sums, self._count = np.zeros(len(LIMITS)), 0
+
+    def update(self, plates: list[Plate], camera: Camera, pose: F64) -> None:
+        """Take in the plates of an image: the largest legible one counts.
+
+        Args:
+            plates: The plates.
+            camera: The camera.
+            pose: Pose of the camera in the world [4, 4].
+        """
+        legible = [plate for plate in plates if plate.score >= self.settings.score]
+        if not legible:
+            return
+        plate = max(legible, key=lambda entry: entry.diameter)
+        depth = camera.intrinsic[1, 1] * PLATE / plate.diameter
+        ray = np.linalg.solve(camera.intrinsic, [*plate.centre, 1.0]) * depth
+        place = (pose[:3, :3] @ ray + pose[:3, 3])[:2]
+        if self._place is None or np.hypot(*(place - self._place)) > 0.35 * depth + 1.0:
+            self._sums, self._count = np.zeros(len(LIMITS)), 0
+        # Nearer plates are sharper, and count more.
+        self._place, self._sums = place, self._sums + plate.correlations * plate.diameter
+        self._count += 1
+        order = np.sort(self._sums)
+        if self._count >= self.settings.confirm and order[-1] - order[-2] >= self.settings.margin * order[-1]:
+            self.limit = LIMITS[int(self._sums.argmax())]
