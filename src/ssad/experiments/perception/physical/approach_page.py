@@ -85,15 +85,17 @@ def approach_groups(run: PhysicalRun) -> list[ApproachGroup]:
     groups = []
     carriers = list(dict.fromkeys(carrier for name, carrier in run.attacks if name != "clean"))
     for (_, test), detector, carrier in product(run.pairs, run.judges, carriers):
-        clean = run.clean_lines(test, "approach", detector, carrier)
-        lines = run.all_lines(test, "approach", detector, carrier)
-        controls = tuple(line for line in lines if is_control(line["attack"]) and line["source"] in ("", detector))
-        trained = [line for line in lines if not is_control(line["attack"]) and line["attack"] != "clean"]
-        attacks = [line for line in trained if line["source"] in ("", detector)] or trained
-        if attacks is trained:
-            controls = tuple(line for line in lines if is_control(line["attack"]))
-        if clean and clean[0]["axis"] and attacks:
-            groups.append(ApproachGroup(test, detector, carrier, clean[0], controls, tuple(attacks)))
+        clean_lines = run.clean_lines(test, "approach", detector, carrier)
+        carrier_lines = run.all_lines(test, "approach", detector, carrier)
+        control_lines = tuple(
+            line for line in carrier_lines if is_control(line["attack"]) and line["source"] in ("", detector)
+        )
+        trained_lines = [line for line in carrier_lines if not is_control(line["attack"]) and line["attack"] != "clean"]
+        attack_lines = [line for line in trained_lines if line["source"] in ("", detector)] or trained_lines
+        if attack_lines is trained_lines:
+            control_lines = tuple(line for line in carrier_lines if is_control(line["attack"]))
+        if clean_lines and clean_lines[0]["axis"] and attack_lines:
+            groups.append(ApproachGroup(test, detector, carrier, clean_lines[0], control_lines, tuple(attack_lines)))
     return groups
 
 
