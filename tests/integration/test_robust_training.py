@@ -94,7 +94,7 @@ def test_a_suite_that_cannot_run_fails_before_the_training(tmp_path: Path, monke
 def test_both_arms_are_trained_attacked_and_compared(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ["epochs=1", "batch=2", "validate=1", "radius=2", "amp=false"]
+    small = ["epochs=1", "batch=2", "validate=1", "radius=2"]
     suite = [f"data={recorded}", "attacks=[fgsm]", "sweeps=[]", "steps=1", "replicates=0"]
     options = ["--data", str(recorded), "--weights", str(SHIPPED / "fcos3d-light.safetensors"), "--device", "cpu"]
     options += [part for value in small for part in ("--set", value)]
