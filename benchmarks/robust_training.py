@@ -21,6 +21,7 @@ from ssad.core.checkpoints import WeightsCard, read_card
 from ssad.core.errors import ConfigError
 from ssad.experiments.perception.digital.run import DigitalRun, load_digital_run
 from ssad.experiments.perception.digital.tables import hardened_table
+from ssad.experiments.suites import load_suite
 from ssad.report.load import load_run
 from ssad.report.tables import to_markdown
 from ssad.training.detector import DetectorPlan, parse_changes, run_training
@@ -124,6 +125,8 @@ def main() -> None:
         return
     if options.data is None or options.weights is None:
         parser.error("--data and --weights are needed to train")
+    # Wrong keys should fail before hours of training.
+    load_suite("digital", (*SUITE, *options.suite))
     for plan in arms(
         options.recipe, options.data, options.weights, options.out, settings=options.settings, device=options.device
     ):

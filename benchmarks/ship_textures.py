@@ -1,8 +1,9 @@
 """Ship the textures of a finished run: python benchmarks/ship_textures.py RUN [--attacks adv-patch,vanishing-all-sides]
 
 RUN is what `ssad run physical` wrote. For each attack that was trained against a detector and scored on it, NAME.png
-and NAME.json go to src/ssad/scenarios/static/physical/trained; suites then name them (`texture: NAME`). What did not
-beat the controls is left out: the run's own records decide. Of an attack in several sizes the last that did ships.
+and NAME.json go to src/ssad/scenarios/static/physical/textures/trained; suites then name them (`texture: NAME`). What
+did not beat the controls is left out, and what inks cannot print too: the run's own records decide. Of an attack in
+several sizes the last that did ships.
 """
 
 from __future__ import annotations
@@ -41,6 +42,13 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         if margin is None or margin <= 0:
             print(f"{title} in {line['test']} is not stronger than the controls: left out")
             continue
+        if not line["spec"].get("inks") or line.get("outside_gamut") != 0.0:
+            outside = line.get("outside_gamut")
+            reason = (
+                "no tones of inks" if outside is None else f"{outside:.1%} of its texels outside the gamut of the inks"
+            )
+            print(f"{title} in {line['test']} cannot be printed ({reason}): left out")
+            continue
         spec, pair, around = line["spec"], line["spec"]["pair"], line["spec"]["around"]
         sort = class_of_target(parse_target(suite["target"]))
         place = f"{suite['behind']:g} m behind" if sort == "car" else f"of a {sort.replace('_', ' ')}"
@@ -63,7 +71,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             run.command,
             int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
-            inks=CHARACTERISATION if spec.get("inks") else "",
+            inks=CHARACTERISATION,
         )
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"

@@ -82,12 +82,20 @@ def test_the_page_says_the_start_and_sets_robust_weights_beside_the_control() ->
     ]
 
 
+def test_a_suite_that_cannot_run_fails_before_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ["--data", str(tmp_path), "--weights", "w.safetensors", "--set", "radius=2", "--suite", "recorded=null"]
+    monkeypatch.setattr(sys, "argv", ["robust_training", "--out", str(tmp_path), *options])
+    with pytest.raises(ConfigError, match="recorded"):
+        main()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow  # two trainings and attacks on both
 def test_both_arms_are_trained_attacked_and_compared(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ["epochs=1", "batch=2", "validate=1", "radius=2"]
-    suite = [f"data={recorded}", "recorded=null", "attacks=[fgsm]", "sweeps=[]", "steps=1", "replicates=0"]
+    suite = [f"data={recorded}", "attacks=[fgsm]", "sweeps=[]", "steps=1", "replicates=0"]
     options = ["--data", str(recorded), "--weights", str(SHIPPED / "fcos3d-light.safetensors"), "--device", "cpu"]
     options += [part for value in small for part in ("--set", value)]
     options += [part for value in suite for part in ("--suite", value)]

@@ -104,7 +104,7 @@ def _to_squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
     return pixel_shuffle(conv2d(padded, weights, stride=2), 2)[:, :, :height, :width]
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=192)  # parts of images have many sizes, and copies to a GPU take long
 def _halving_matrices(size: int, levels: int, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
     """Return the matrices [n, m] of an axis from each level of the pyramid to the next."""
     matrices = []
@@ -177,33 +177,44 @@ def scatter_parts(
     """
     if not sensor.scatters:
         return light
-    levels, weights = level_count(*image_size), glare_weights(sensor, *image_size)
+    level_total, level_weights = level_count(*image_size), glare_weights(sensor, *image_size)
     source_level = ghost_source_level(*image_size)
     part_levels = min(PART_LEVELS, source_level)
     image = light.permute(0, 3, 1, 2)
-    pyramid = _halve([image], light.shape[1:3], range(part_levels))
+    part_pyramid = _halve([image], light.shape[1:3], range(part_levels))
     # From there on the light reaches far, so the levels are those of the whole images.
-    sides = [len(pyramid_weights(side, part_levels)[-1]) for side in image_size]
-    coarse = pyramid[-1].new_zeros((len(light), *sides, 3))
+    coarse_size = [len(pyramid_weights(side, part_levels)[-1]) for side in image_size]
+    coarse_light = part_pyramid[-1].new_zeros((len(light), *coarse_size, 3))
     first_pixels = torch.tensor(corners).to(light.device)
-    first_cells = first_pixels // 2**part_levels
-    rows, columns = (
-        first_cells[:, axis, None] + torch.arange(pyramid[-1].shape[2 + axis], device=light.device) for axis in (0, 1)
+    first_coarse_cells = first_pixels // 2**part_levels
+    cell_rows, cell_columns = (
+        first_coarse_cells[:, axis, None] + torch.arange(part_pyramid[-1].shape[2 + axis], device=light.device)
+        for axis in (0, 1)
     )
-    cells = torch.arange(len(light), device=light.device)[:, None, None], rows[:, :, None], columns[:, None, :]
-    coarse = coarse.index_put(cells, pyramid[-1].permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-    coarse_pyramid = _halve([coarse], image_size, range(part_levels, levels))
-    scattered = torch.zeros_like(coarse_pyramid[-1])
-    for level in range(levels, part_levels - 1, -1):
-        scattered = _add_level(scattered, coarse_pyramid[level - part_levels], float(weights[level - 1]))
-    scattered = scattered.permute(0, 2, 3, 1)[cells].permute(0, 3, 1, 2)
-    for level in range(part_levels - 1, 0, -1):
-        scattered = _add_level(scattered, pyramid[level], float(weights[level - 1]))
-        if level == GHOST_LEVEL and sensor.flare > 0:
-            source = coarse_pyramid[source_level - part_levels]
-            scattered = scattered + _ghosts(source, sensor, image_size, scattered.shape[2:], first_pixels)
-    behind = image * direct_share(sensor, weights) + _enlarge(scattered, *light.shape[1:3])
-    return behind.permute(0, 2, 3, 1)
+    coarse_cells = (
+        torch.arange(len(light), device=light.device)[:, None, None],
+        cell_rows[:, :, None],
+        cell_columns[:, None, :],
+    )
+    coarse_light = coarse_light.index_put(coarse_cells, part_pyramid[-1].permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    coarse_pyramid = _halve([coarse_light], image_size, range(part_levels, level_total))
+    scattered_light = torch.zeros_like(coarse_pyramid[-1])
+    for pyramid_level in range(level_total, part_levels - 1, -1):
+        scattered_light = _add_level(
+            scattered_light, coarse_pyramid[pyramid_level - part_levels], float(level_weights[pyramid_level - 1])
+        )
+    scattered_light = scattered_light.permute(0, 2, 3, 1)[coarse_cells].permute(0, 3, 1, 2)
+    for pyramid_level in range(part_levels - 1, 0, -1):
+        scattered_light = _add_level(
+            scattered_light, part_pyramid[pyramid_level], float(level_weights[pyramid_level - 1])
+        )
+        if pyramid_level == GHOST_LEVEL and sensor.flare > 0:
+            ghost_source = coarse_pyramid[source_level - part_levels]
+            scattered_light = scattered_light + _ghosts(
+                ghost_source, sensor, image_size, scattered_light.shape[2:], first_pixels
+            )
+    light_behind = image * direct_share(sensor, level_weights) + _enlarge(scattered_light, *light.shape[1:3])
+    return light_behind.permute(0, 2, 3, 1)
 
 
 def _halve(pyramid: list[Tensor], size: Sequence[int], levels: range) -> list[Tensor]:
@@ -237,24 +248,30 @@ def _ghosts(
         shown_size: h and w, pixels of the level.
         corners: First row and column of each part, px of the image [B, 2].
     """
-    level = min(GHOST_LEVEL, level_count(*image_size))
+    ghost_level = min(GHOST_LEVEL, level_count(*image_size))
     source_level = ghost_source_level(*image_size)
-    sizes, tints = _ghost_constants(sensor, source.device, source.dtype)
-    coordinates = []
+    ghost_sizes, ghost_tints = _ghost_constants(sensor, source.device, source.dtype)
+    sample_coordinates = []
     for axis in (0, 1):
-        places = (torch.arange(shown_size[axis], dtype=source.dtype, device=source.device) + 0.5) * 2**level
-        centre = 0.5 * image_size[axis]
-        places = ((places + corners[:, axis, None] - centre) / sizes + centre) / 2**source_level
+        sample_places = (
+            torch.arange(shown_size[axis], dtype=source.dtype, device=source.device) + 0.5
+        ) * 2**ghost_level
+        image_centre = 0.5 * image_size[axis]
+        sample_places = (
+            (sample_places + corners[:, axis, None] - image_centre) / ghost_sizes + image_centre
+        ) / 2**source_level
         # From pixels to the -1 to 1 of `grid_sample`.
-        coordinates.append(2 * places / source.shape[2 + axis] - 1)
-    rows, columns = coordinates
+        sample_coordinates.append(2 * sample_places / source.shape[2 + axis] - 1)
+    sample_rows, sample_columns = sample_coordinates
     # All ghosts at once: few operations take little time on a GPU.
-    shape = (len(sizes), len(source), *shown_size)
-    grid = torch.stack([columns[:, :, None].expand(shape), rows[:, :, :, None].expand(shape)], -1).flatten(0, 1)
-    sources = source.expand(len(sizes), *source.shape).flatten(0, 1)
-    ghosts = grid_sample(sources, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    ghosts = ghosts.reshape(*shape[:2], *ghosts.shape[1:])
-    return (ghosts * tints).sum(0)
+    grid_shape = (len(ghost_sizes), len(source), *shown_size)
+    sample_grid = torch.stack(
+        [sample_columns[:, :, None].expand(grid_shape), sample_rows[:, :, :, None].expand(grid_shape)], -1
+    ).flatten(0, 1)
+    ghost_sources = source.expand(len(ghost_sizes), *source.shape).flatten(0, 1)
+    ghost_images = grid_sample(ghost_sources, sample_grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    ghost_images = ghost_images.reshape(*grid_shape[:2], *ghost_images.shape[1:])
+    return (ghost_images * ghost_tints).sum(0)
 
 
 @lru_cache(maxsize=8)

@@ -299,6 +299,14 @@ def test_an_approach_has_cells_of_its_own_and_textures_are_trained_on_its_distan
     assert [spec.inks for spec in specs] == [True, True, True, False]
     assert specs[1].name == specs[2].name
     assert len({spec.name for spec in specs}) == 3
+    lit = suite(attacks=[], lights=["laser"], seeds=1, approach=approach | {"train": False})
+    cells = [cell for cell in Physical().plan(lit).cells if cell.fields["view"] == "approach"]
+    assert [cell.fields["attack"] for cell in cells] == ["clean", "laser", "random laser"]
+    assert {recording.out.name for recording in lit.recordings(tmp_path, "cpu")} == {
+        "Twinford",
+        "Oldmarket",
+        "Oldmarket-approach",
+    }
     keys = [{cell.key for cell in Physical().plan(one).cells} for one in (suite(), given)]
     assert len(keys[0] & keys[1]) == 2, "clean ones and controls from behind do not depend on the approach"
 

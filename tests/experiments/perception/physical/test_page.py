@@ -163,6 +163,35 @@ def test_the_figure_has_hollow_points_where_nothing_is_proven(approached: Physic
     assert "50 km/h" not in svg, "beyond the axis"
 
 
+def test_judges_and_hours_have_figures_of_their_own(folder: Path) -> None:
+    """A judge is shown what was trained against others; the clean target beside a light is that of its hour."""
+    night, far = "light, night", {5.0: 0.9, 20.0: 0.8}
+    lines = [
+        line("clean", "", 0.9, detector="fcos3d-light", **approach(far, 20.0)),
+        line(
+            "das", "camouflage", 0.3, source="yolov5n", detector="fcos3d-light", **approach({5.0: 0.4, 20.0: 0.1}, 5.0)
+        ),
+        line("clean", night, 0.8, **approach(far, 18.0)),
+        line("clean", "light, noon", 0.9, **approach(far, 20.0)),
+        line("laser", f"{night}, watts 10.0", 0.7, source="yolov5n", **approach({5.0: 0.5, 20.0: 0.1}, 5.0)),
+        line("random laser", f"{night}, watts 10.0", 0.7, **approach({5.0: 0.85, 20.0: 0.7}, 19.0)),
+    ]
+    write_lines(folder, lines)
+    run = PhysicalRun(load_run(folder))
+    assert [title for title, _ in approach_figures(run)] == [
+        "fcos3d-light, Oldmarket, camouflage",
+        f"yolov5n, Oldmarket, {night}, watts 10.0",
+    ]
+    rows = [row.head[1:3] for row in approach_table(run, "AP50").rows]
+    assert rows == [
+        ("fcos3d-light", "clean"),
+        ("fcos3d-light", "DAS, against yolov5n"),
+        ("yolov5n", "clean, night"),
+        ("yolov5n", f"strongest control, {night}, watts 10.0"),
+        ("yolov5n", "laser, night, watts 10.0"),
+    ]
+
+
 def test_a_figure_for_the_documentation_stands_alone(approached: PhysicalRun, tmp_path: Path) -> None:
     (line,) = write_figures(approached.run.folder, "physical", tmp_path)
     assert line.endswith("(../images/physical-yolov5n-oldmarket-camouflage.svg)")

@@ -78,18 +78,31 @@ class ApproachGroup:
 
 
 def approach_groups(run: PhysicalRun) -> list[ApproachGroup]:
-    """Return the approaches of a run that have an attack."""
+    """Return the approaches of a run that have an attack.
+
+    Attacks are those that were trained against the detector itself; if there are none, those against others.
+    """
     groups = []
     carriers = list(dict.fromkeys(carrier for name, carrier in run.attacks if name != "clean"))
     for (_, test), detector, carrier in product(run.pairs, run.judges, carriers):
-        clean = run.lines(test, "approach", detector, ("clean", ""))
-        names = [name for name, attack_carrier in run.attacks if attack_carrier == carrier]
-        lines = {name: run.lines(test, "approach", detector, (name, carrier)) for name in names}
-        controls = tuple(line for name in names if is_control(name) for line in lines[name])
-        attacks = tuple(lines[name][0] for name in names if not is_control(name) and lines[name])
-        if clean and clean[0]["axis"] and attacks:
-            groups.append(ApproachGroup(test, detector, carrier, clean[0], controls, attacks))
+        clean_lines = run.clean_lines(test, "approach", detector, carrier)
+        carrier_lines = run.all_lines(test, "approach", detector, carrier)
+        control_lines = tuple(
+            line for line in carrier_lines if is_control(line["attack"]) and line["source"] in ("", detector)
+        )
+        trained_lines = [line for line in carrier_lines if not is_control(line["attack"]) and line["attack"] != "clean"]
+        attack_lines = [line for line in trained_lines if line["source"] in ("", detector)] or trained_lines
+        if attack_lines is trained_lines:
+            control_lines = tuple(line for line in carrier_lines if is_control(line["attack"]))
+        if clean_lines and clean_lines[0]["axis"] and attack_lines:
+            groups.append(ApproachGroup(test, detector, carrier, clean_lines[0], control_lines, tuple(attack_lines)))
     return groups
+
+
+def _title(line: Line) -> str:
+    """Return the title of a record, with the detector that its texture was trained against if that is another."""
+    title = title_of((line["attack"], line["carrier"]))
+    return f"{title}, against {line['source']}" if line["source"] not in ("", line["detector"]) else title
 
 
 def _cell(line: Line, distance: float) -> dict[str, Any]:
@@ -143,7 +156,7 @@ def _figure(group: ApproachGroup) -> str:
             )
             for distance in axis
         ]
-        return Curve(title_of((line["attack"], line["carrier"])), points, colour, dashes)
+        return Curve(_title(line), points, colour, dashes)
 
     plots = []
     for metric, title in SCORES.items():
@@ -153,9 +166,10 @@ def _figure(group: ApproachGroup) -> str:
             for distance in axis:
                 control = group.control_at(distance, metric)
                 assert control is not None
-                name = title_of((control["attack"], control["carrier"]))
                 points.append(
-                    CurvePoint(place(distance), _percent(control, distance, metric), f"{distance:g} m, {name}")
+                    CurvePoint(
+                        place(distance), _percent(control, distance, metric), f"{distance:g} m, {_title(control)}"
+                    )
                 )
             curves.append(Curve("strongest control", points, "var(--soft)", "5 4"))
         curves += [
@@ -172,10 +186,10 @@ def _figure(group: ApproachGroup) -> str:
 def _rows(run: PhysicalRun) -> list[tuple[ApproachGroup, Line | None, Line]]:
     """Return the groups with the attack of a row (None: a clean row or that of controls) and its record."""
     rows: list[tuple[ApproachGroup, Line | None, Line]] = []
-    listed_groups: set[tuple[str, str]] = set()
+    listed_lines: list[Line] = []
     for group in approach_groups(run):
-        if (group.test, group.detector) not in listed_groups:
-            listed_groups.add((group.test, group.detector))
+        if group.clean not in listed_lines:
+            listed_lines.append(group.clean)
             rows.append((group, None, group.clean))
         rows += [(group, None, line) for line in group.controls]
         rows += [(group, line, line) for line in group.attacks]
@@ -186,13 +200,13 @@ def approach_table(run: PhysicalRun, metric: str) -> Table:
     """Return a score against distance, AP50 or confidence: clean, the strongest control at each distance, attacks."""
     Row = tuple[ApproachGroup, str, Line | None]
     rows: list[Row] = []
-    listed_groups: set[tuple[str, str]] = set()
+    listed_lines: list[Line] = []
     for group in approach_groups(run):
-        if (group.test, group.detector) not in listed_groups:
-            listed_groups.add((group.test, group.detector))
-            rows.append((group, "clean", group.clean))
+        if group.clean not in listed_lines:
+            listed_lines.append(group.clean)
+            rows.append((group, _title(group.clean), group.clean))
         rows += [(group, f"strongest control, {group.carrier}", None)] if group.controls else []
-        rows += [(group, title_of((line["attack"], line["carrier"])), line) for line in group.attacks]
+        rows += [(group, _title(line), line) for line in group.attacks]
     distances = sorted({distance for group, *_ in rows for distance in group.axis})
 
     def value(row: Row, distance: float) -> TableCell:
@@ -254,7 +268,7 @@ def detection_table(run: PhysicalRun) -> Table:
         rows={
             "Town": lambda row: row[0].test,
             "Detector": lambda row: row[0].detector,
-            "Attack": lambda row: title_of((row[2]["attack"], row[2]["carrier"])) + _draw(row[2]),
+            "Attack": lambda row: _title(row[2]) + _draw(row[2]),
             "At the end of the axis": end,
         },
         columns=columns,

@@ -57,6 +57,22 @@ class PhysicalRun:
         """Attacks and controls with their carriers, in the order of the suite, clean first."""
         return list(dict.fromkeys((line["attack"], line["carrier"]) for line in self.run.lines))
 
+    def clean_lines(self, test: str, view: str, detector: str, carrier: str) -> list[Line]:
+        """Records of the clean images beside a carrier; those of a light are of its hour."""
+        hours = {clean_carrier for name, clean_carrier in self.attacks if name == "clean"}
+        own_hours = [hour for hour in hours if f"{carrier}, ".startswith(f"{hour}, ")]
+        return self.lines(test, view, detector, ("clean", own_hours[0] if own_hours else ""))
+
+    def all_lines(self, test: str, view: str, detector: str, carrier: str) -> list[Line]:
+        """Records of everything with a carrier, whatever it was trained against, in the order of the suite."""
+        return [
+            line
+            for (town, seen_from, judge, (_, own_carrier, _)), lines in self.records.items()
+            if (town, seen_from, judge, own_carrier) == (test, view, detector, carrier)
+            for line in lines
+            if line["status"] == "ok"
+        ]
+
     def lines(
         self, test: str, view: str, detector: str, attack: tuple[str, str], source: str | None = None
     ) -> list[Line]:

@@ -339,9 +339,10 @@ def _texture_rows(  # noqa: PLR0917
 
 
 def _light_rows(table: TargetTable) -> Iterator[CellDescription]:
-    """Yield, for each hour, the clean images, then each light and its controls."""
+    """Yield, for each view and hour, the clean images, then each light and its controls."""
     check_lights(table)
-    for pair, detector in product(table.pairs, table.detectors):
+    views = [DRIVE] if table.approach is None else [DRIVE, APPROACH]
+    for pair, view, detector in product(table.pairs, views, table.detectors):
         rows: list[dict[str, Any]] = [
             {"attack": None, "of": None, "options": {}, "settings": {}, "hour": hour}
             for hour in dict.fromkeys(entry.hour for entry in table.lights)
@@ -359,7 +360,7 @@ def _light_rows(table: TargetTable) -> Iterator[CellDescription]:
             fields = {
                 "test": pair.test,
                 "train": pair.train,
-                "view": "drive",
+                "view": view,
                 "detector": detector,
                 "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}),
                 "attack": _light_title(table, row),
@@ -367,7 +368,7 @@ def _light_rows(table: TargetTable) -> Iterator[CellDescription]:
                 "number": light["number"],
             }
             title_parts = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
-            title = "/".join(map(str, title_parts))
+            title = "/".join(map(str, title_parts)) + (f"/{view}" if view != DRIVE else "")
             yield CellDescription(title, detector, fields, {"attack": None, "light": light})
 
 

@@ -384,31 +384,38 @@ def visible_part(picture: Rendering, view: View, device: str = "cpu") -> dict[st
     It is behind the lens, which scatters the light of the whole picture.
     """
     height, width = picture.radiance.shape[1:3]
-    noise = view_noise(view)
-    assert noise is not None
-    fragments = picture.fragments.copy()
-    light = torch.from_numpy(picture.radiance[:1]).to(device)
-    lens = with_lens_effects(view.sensor, picture.effects)
-    background = scatter(light, lens)
-    places = torch.from_numpy(fragments["place"].astype(np.int64)).to(device)
-    white = torch.from_numpy(np.ascontiguousarray(fragments["light"], np.float32)).to(device)
-    texture_light = torch.zeros_like(light).reshape(-1, 3).index_add(0, places, white).reshape(light.shape)
-    exposure = float(picture.exposure[0])
+    photosite_noise = view_noise(view)
+    assert photosite_noise is not None
+    part_fragments = picture.fragments.copy()
+    scene_light = torch.from_numpy(picture.radiance[:1]).to(device)
+    lens_sensor = with_lens_effects(view.sensor, picture.effects)
+    background_light = scatter(scene_light, lens_sensor)
+    fragment_places = torch.from_numpy(part_fragments["place"].astype(np.int64)).to(device)
+    white_light = torch.from_numpy(np.ascontiguousarray(part_fragments["light"], np.float32)).to(device)
+    texture_light = (
+        torch.zeros_like(scene_light)
+        .reshape(-1, 3)
+        .index_add(0, fragment_places, white_light)
+        .reshape(scene_light.shape)
+    )
+    exposure_factor = float(picture.exposure[0])
     # A white texture gives most light, and a dark background shows it best.
-    change = curve((background + scatter(texture_light, lens)) * exposure) - curve(background * exposure)
-    is_changed = (change[0].amax(-1) > VISIBLE).reshape(-1).index_fill(0, places, True)
+    visible_change = curve((background_light + scatter(texture_light, lens_sensor)) * exposure_factor) - curve(
+        background_light * exposure_factor
+    )
+    is_changed = (visible_change[0].amax(-1) > VISIBLE).reshape(-1).index_fill(0, fragment_places, True)
     rows, columns = np.divmod(torch.nonzero(is_changed)[:, 0].cpu().numpy(), width)
     glow = tuple((int(axis.min()), int(axis.max()) + 1) if len(axis) else (0, 0) for axis in (rows, columns))
     (top, bottom), (left, right) = (_span(*pair) for pair in zip(glow, (height, width), strict=True))
-    rows, columns = np.divmod(fragments["place"].astype(np.int64), width)
-    fragments["place"] = (rows - top) * (right - left) + columns - left
+    rows, columns = np.divmod(part_fragments["place"].astype(np.int64), width)
+    part_fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
         "corner": np.array([top, left]),
-        "radiance": background[0, top:bottom, left:right].cpu().numpy(),
+        "radiance": background_light[0, top:bottom, left:right].cpu().numpy(),
         "exposure": picture.exposure[0],
-        "fragments": fragments,
+        "fragments": part_fragments,
         "glow": np.array(glow),
-        "noise": noise[top:bottom, left:right],
+        "noise": photosite_noise[top:bottom, left:right],
     }
 
 

@@ -56,6 +56,15 @@ def test_a_texture_of_inks_is_written_only_if_they_give_all_of_its_colours(tmp_p
     assert share_outside(shown) == 0.0
 
 
+def test_what_ships_as_printable_can_be_printed() -> None:
+    """Of every shipped card that names inks, and of a colour that none of them gives."""
+    shares = {
+        name: share_outside(colour) for name in shipped_textures() for colour, card in [load_texture(name)] if card.inks
+    }
+    assert shares == dict.fromkeys(shares, 0.0)
+    assert share_outside(torch.tensor([0.0, 0.0, 1.0])[:, None, None]) == 1.0
+
+
 def test_a_texture_of_your_own_is_projected_on_request(tmp_path: Path) -> None:
     save_texture(tmp_path / "mine", picture(), CARD)
     own, projected = (Texture(str(tmp_path / "mine.json"), project=project) for project in (False, True))

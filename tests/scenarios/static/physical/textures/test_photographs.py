@@ -41,6 +41,23 @@ def test_a_turned_car_shows_a_face_in_perspective() -> None:
     assert abs(left - right) > 0.5
 
 
+def test_a_print_is_foreshortened_like_the_face_that_it_lies_on() -> None:
+    """The middle of a print is where the middle of the face projects, nearer to its far side than to its near one."""
+    near = np.array([0.0, 0.0, 5.0, 4.0, 1.6, 2.0, BEHIND[6] + 0.6])
+    intrinsic = np.array([[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]])
+    quad, half = (face_quad((0.0, 0.0, right, 1.0), BOX, near, intrinsic) for right in (1.0, 0.5))
+    assert quad is not None
+    assert half is not None
+    black_and_white = torch.zeros(3, 64, 64)
+    black_and_white[:, :, 32:] = 1.0
+    image = np.full((480, 640, 3), 118, np.uint8)
+    pasted = paste(image, black_and_white, np.ones((64, 64), np.bool_), quad, light=np.ones(3, np.float32))
+    is_white = pasted[240, :, 0] > 200
+    edge, expected = int(is_white.argmax()), float(half[1:3, 0].mean())
+    assert edge == pytest.approx(expected, abs=4.0)
+    assert abs(expected - float(quad[:, 0].mean())) > 10.0, "an affine print would have its middle elsewhere"
+
+
 def test_without_a_3d_box_the_2d_box_is_the_face() -> None:
     unknown = np.full(7, np.nan)
     assert face_quad((0.5, 0.5, 1.0, 1.0), BOX, unknown, None)[0] == pytest.approx([80, 48])  # type: ignore[index]
