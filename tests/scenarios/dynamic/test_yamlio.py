@@ -476,7 +476,19 @@ def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.Monk
     towns, learned = ("natural-crossgate", "natural-twinford"), ("training", "training-lanes")
     drawn = ("natural-uniform", "natural-unselected")
     shipped = tuple(
-        sorted(("lane-keeping", "lane-traffic", "natural", *towns, *drawn, "precrash", "stop-signs", *learned))
+        sorted(
+            (
+                "lane-keeping",
+                "lane-traffic",
+                "natural",
+                *towns,
+                *drawn,
+                "precrash",
+                "speed-signs",
+                "stop-signs",
+                *learned,
+            )
+        )
     )
     assert set_names() == shipped
     mine = scenario_from({**PLAIN, "name": "mine/0"})

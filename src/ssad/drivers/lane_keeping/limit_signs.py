@@ -27,12 +27,13 @@ LIMITS: Final = tuple(range(10, 150, 10))  # km/h
 WHITE: Final = 0.76  # radius of the white disc, as a share of that of the plate
 PLATE: Final = 0.62  # m, diameter that tells the distance of a plate
 CELLS: Final = 28  # side of the square in which figures are compared
+LEFT_EDGE: Final = 0.42  # share of the width from which plates are read: signs stand on the right of the road
 ZOOM: Final = 2  # the upper half of an image is enlarged before plates are located
 SMOOTH: Final = 1.2  # pixels of the enlarged image, before red is told
-MIN_PIXELS: Final = 11.0  # least diameter of a plate in the image
+MIN_PIXELS: Final = 14.0  # least diameter of a plate in the image
 REDNESS: Final = (0.41, 0.46, 0.52)  # thresholds of R / (R + G + B), tried in turn
 FORM: Final = (0.72, 1.39)  # width by height of a hole
-ROUNDNESS: Final = 0.68  # least share of its box that a hole covers; a disc has 0.79
+ROUNDNESS: Final = (0.68, 0.87)  # share of its box that a hole covers; a disc has 0.79, a window 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,8 +46,8 @@ class LimitReading:
         margin: Minimum lead of a limit over the next one in the sum of the correlations of a sign, as a share of it.
     """
 
-    confirm: int = 3
-    score: float = 0.6
+    confirm: int = 2
+    score: float = 0.84
     margin: float = 0.03
 
     def __post_init__(self) -> None:
@@ -87,10 +88,11 @@ def find_plates(image: U8, camera: Camera) -> list[Plate]:
 
     Args:
         image: uint8 [3, H, W], RGB.
-        camera: Its camera; plates stand above the horizon, on either side of the road.
+        camera: Its camera; plates are looked for above the horizon and right of `LEFT_EDGE`.
     """
     rows = int(min(camera.intrinsic[1, 2] + 0.02 * camera.height, camera.height))
-    picture = np.ascontiguousarray(np.moveaxis(image[:, :rows], 0, -1))
+    first = int(LEFT_EDGE * camera.width)
+    picture = np.ascontiguousarray(np.moveaxis(image[:, :rows, first:], 0, -1))
     enlarged = cv2.resize(picture, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     # The colour filter of the sensor breaks thin rings into dots.
     smooth = cv2.GaussianBlur(enlarged, (0, 0), SMOOTH)
@@ -100,9 +102,9 @@ def find_plates(image: U8, camera: Camera) -> list[Plate]:
     for threshold in REDNESS:
         red = ((share > threshold) & (lead > 8.0)).astype(np.uint8)
         for x, y, diameter in _round_holes(red):
-            if all(np.hypot(x - p.centre[0], y - p.centre[1]) > 0.5 * p.diameter for p in plates):
+            if all(np.hypot(first + x - p.centre[0], y - p.centre[1]) > 0.5 * p.diameter for p in plates):
                 correlations = _compare(enlarged, x * ZOOM, y * ZOOM, diameter * ZOOM)
-                plates.append(Plate((x, y), diameter, correlations))
+                plates.append(Plate((first + x, y), diameter, correlations))
     return plates
 
 
@@ -117,7 +119,7 @@ def _round_holes(red: U8) -> list[tuple[float, float, float]]:
         diameter = 0.5 * (width + height) / WHITE / ZOOM
         if parent < 0 or diameter < MIN_PIXELS or not FORM[0] < width / max(height, 1) < FORM[1]:
             continue
-        if cv2.contourArea(contour) > ROUNDNESS * (width * height):
+        if ROUNDNESS[0] < cv2.contourArea(contour) / (width * height) < ROUNDNESS[1]:
             holes.append(((x + 0.5 * width) / ZOOM, (y + 0.5 * height) / ZOOM, diameter))
     return holes
 
