@@ -116,9 +116,8 @@ def test_the_plate_is_labelled_and_the_post_is_not() -> None:
     assert kinds == {"stop_sign": 10, "yield_sign": None, "limit_sign": None, "": None, "car": 0, "barrier": 9}
 
 
-@pytest.mark.parametrize("town", ["Oldmarket", "Larkhill"])
-def test_speed_limit_signs_show_the_limit_of_their_road_clear_of_roads_and_crossings(town: str) -> None:
-    graph, limit_signs = ground(town)[0], cached_street(load_town(town)).limit_signs.astype(np.float64)
+def test_speed_limit_signs_show_the_limit_of_their_road_clear_of_roads_and_crossings() -> None:
+    graph, limit_signs = ground("Oldmarket")[0], cached_street(load_town("Oldmarket")).limit_signs.astype(np.float64)
     assert len(limit_signs) > 20
     driving = graph.kind[np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))] == LaneType.DRIVING
     limits = np.repeat(graph.speed_limit, np.diff(graph.offset))[driving]

@@ -34,13 +34,13 @@ def test_a_sign_that_changes_is_told_to_sensors_alone() -> None:
 
 
 def test_speed_limit_signs_change_by_their_figures() -> None:
-    scenario = next(scenario for scenario in load_scenarios("speed-signs") if scenario.group == "limit-60")
+    (scenario, *_) = load_scenarios("stop-signs")
     town = load_town(scenario.town)
     episode = build_episode(scenario, town, seed=0)
-    assert SignChange("limit-60").applies_to(episode, town) == EGO
+    assert SignChange("limit-30").applies_to(episode, town) == EGO
     assert SignChange("limit", "sticker-8").applies_to(episode, town) == EGO
-    assert SignChange("limit-30").applies_to(episode, town) is None
-    assert SignChange("limit", "limit-60").applies_to(episode, town) is None, "it stays the same"
+    assert SignChange("limit-60").applies_to(episode, town) is None
+    assert SignChange("limit", "limit-30").applies_to(episode, town) is None, "it stays the same"
     gone = SignChange("limit").bodies()
     assert set(gone.values()) == {None}
     assert len(gone) == 14
