@@ -155,10 +155,11 @@ class _Schedule:
             ) as self.pool,
             LiveProgress(self.plan.suite.name, total, finished_count, console=resources.console) as self.progress,
         ):
-            for batch in self.kind.batches(self.plan, ready_cells, min(task_count, workers or default_workers())):
-                self._add(batch)
+            # Pieces first: cells wait for them, and some take long.
             for name in self.data:
                 self._add_piece(name, list(self.sharing[name]))
+            for batch in self.kind.batches(self.plan, ready_cells, min(task_count, workers or default_workers())):
+                self._add(batch)
             for outcome in self.pool.outcomes(self.progress.tick):
                 if isinstance(outcome.task.label, list):
                     self._batch_ended(outcome.task.label, outcome)

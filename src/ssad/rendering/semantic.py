@@ -63,7 +63,17 @@ _MATERIALS: Final = {
     SemanticClass.TRAFFIC_LIGHT: ("signal_red", "signal_amber", "signal_green", "black_plastic"),
     SemanticClass.TRAFFIC_SIGN: ("sign_white", "sign_red", "sign_blue", "sign_yellow", "sign_back", "sign_ink"),
     SemanticClass.VEGETATION: (
-        *("leaves_round", "leaves_tall", "leaves_birch", "leaves_conifer", "twigs", "hedge", "bark", "forest", "tree_line"),
+        *(
+            "leaves_round",
+            "leaves_tall",
+            "leaves_birch",
+            "leaves_conifer",
+            "twigs",
+            "hedge",
+            "bark",
+            "forest",
+            "tree_line",
+        ),
     ),
     SemanticClass.TERRAIN: (
         *("meadow", "dry_grass", "grass", "grass_blades", "soil", "lawn", "hills"),

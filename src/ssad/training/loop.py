@@ -46,7 +46,7 @@ class TrainingStep(nn.Module):
             dense = self.detector.dense(images, intrinsics)
         assignment = self.detector.assign(dense, truth)
         if self.doubt:
-            assignment = self.detector.doubted(dense, assignment, doubt=self.doubt)
+            assignment = self.detector.discount_centreness(dense, assignment, doubt=self.doubt)
         return dict(self.detector.losses(dense, assignment))
 
 

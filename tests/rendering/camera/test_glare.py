@@ -16,7 +16,7 @@ from ssad.rendering.camera.effects import NO_EFFECTS
 from ssad.rendering.camera.render import RenderQuality, SceneWeather, View, develop_radiance, render, scene_light
 from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.sensor import DEFAULT_SENSOR, PINHOLE, SensorModel
-from ssad.rendering.camera.torch_sensor import ChangedWindow, develop, photosites, scatter
+from ssad.rendering.camera.torch_sensor import ChangedWindow, develop, photosites, scatter, scatter_parts
 from ssad.rendering.meshes.mesh import Material, build
 
 HAZY = SensorModel(glare=1.0)
@@ -106,6 +106,26 @@ def test_a_ghost_is_mirrored_about_the_middle_and_takes_its_light_from_the_image
     rows, columns = np.mgrid[32:64, :64]
     assert (ghost[..., 1] * rows).sum() / ghost[..., 1].sum() == pytest.approx(63 - 16, abs=0.5)
     assert (ghost[..., 1] * columns).sum() / ghost[..., 1].sum() == pytest.approx(63 - 44, abs=0.5)
+
+
+def test_parts_scatter_as_the_whole_images_do() -> None:
+    """Two parts, one of them at the corner of its image; all else is dark."""
+    size, corners, part = (180, 256), [(32, 48), (132, 160)], (48, 96)
+    corners[1] = (size[0] - part[0]) // 16 * 16, size[1] - part[1]
+    part = size[0] - corners[1][0], part[1]
+    light = np.zeros((2, *size, 3))
+    generator = np.random.default_rng(5)
+    light[0, 50:58, 70:120] = generator.uniform(0, 900, (8, 50, 3))
+    light[1, 150:180, 200:256] = generator.uniform(0, 900, (30, 56, 3))
+    crops = [(slice(row, row + part[0]), slice(column, column + part[1])) for row, column in corners]
+    whole = scatter(torch.tensor(light), FLARING)
+    parts = torch.stack([torch.tensor(light)[index][crop] for index, crop in enumerate(crops)])
+    shown = scatter_parts(parts, FLARING, corners, size)
+    # Near the border of a part that is none of the image, what lies beyond is missing.
+    inner_parts = (slice(16, -16), slice(16, -16)), (slice(16, None), slice(16, None))
+    for index, (crop, inner) in enumerate(zip(crops, inner_parts, strict=True)):
+        torch.testing.assert_close(shown[index][inner], whole[index][crop][inner], rtol=0, atol=1e-6 * 900)
+    assert scatter_parts(parts, PINHOLE, corners, size) is parts
 
 
 def test_gradients_of_scattered_light_equal_finite_differences() -> None:

@@ -24,7 +24,7 @@ def ground(name: str) -> Ground:
 @pytest.mark.parametrize("name", ["Twinford", "Oldmarket"])
 def test_yards_lie_beside_the_pavement_with_nothing_in_them(name: str) -> None:
     scene, area = cached_street(name), ground(name)
-    is_leaf = np.array([material.name.startswith("leaves") for material in scene.materials])[scene.material]
+    is_leaf = np.array([material.name.startswith(("leaves", "twigs")) for material in scene.materials])[scene.material]
     solid = scene.vertices[np.unique(scene.faces[~is_leaf])].astype(np.float64)  # branches may hang over a yard
     upright = solid[(solid[:, 2] > 0.35) & (solid[:, 2] < 2.4), :2]
     assert len(scene.yards) > 30

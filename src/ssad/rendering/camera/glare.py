@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -170,57 +170,80 @@ def scatter(radiance: Any, sensors: list[SensorModel]) -> Any:
     """
     if not any(sensor.scatters for sensor in sensors):
         return radiance
-    weights = _weights_of(radiance, sensors)
-    scattered = _scattered(radiance, sensors, weights)
+    device, (_, height, width) = radiance.device, radiance.shape
+    scattered = _scattered(radiance, sensors)
+    direct = _lens_tables(tuple(sensors), height, width, str(device)).direct
+    out = wp.empty(radiance.shape, dtype=wp.vec3, device=device)
+    wp.launch(kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=device)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class LensTables:
+    """Arrays of the kernels that follow from the sensors and the size of images.
+
+    Attributes:
+        weights: Of each level of the pyramid and each image [levels, B].
+        direct: Share of the light that is neither scattered nor reflected [B].
+        ghosts: Of each image [B, GHOSTS]; None if no lens has any.
+        centres: Of each image, px from its corner [B].
+    """
+
+    weights: Any
+    direct: Any
+    ghosts: Any
+    centres: Any
+
+
+@lru_cache(maxsize=16)
+def _lens_tables(sensors: tuple[SensorModel, ...], height: int, width: int, device: str) -> LensTables:
+    """Return the arrays of the sensors of B images of a size on a device."""
+    weights = np.array([glare_weights(sensor, height, width) for sensor in sensors])
     shares = [
         direct_share(sensor, values) if sensor.scatters else 1.0
         for sensor, values in zip(sensors, weights, strict=True)
     ]
-    direct = wp.array(np.array(shares, np.float32), dtype=float, device=radiance.device)
-    out = wp.empty(radiance.shape, dtype=wp.vec3, device=radiance.device)
-    wp.launch(
-        kernels.mix, dim=out.shape[:2], inputs=[radiance, scattered, direct], outputs=[out], device=radiance.device
+    ghosts = None
+    if any(sensor.flare > 0.0 for sensor in sensors):
+        rows: Any = np.array([ghost_lights(sensor) for sensor in sensors], kernels.Ghost.numpy_dtype())  # type: ignore[attr-defined]
+        ghosts = wp.array(rows, dtype=kernels.Ghost, device=device)
+    return LensTables(
+        wp.array(np.ascontiguousarray(weights.T, np.float32), dtype=float, device=device),
+        wp.array(np.array(shares, np.float32), dtype=float, device=device),
+        ghosts,
+        wp.array(np.tile([0.5 * width, 0.5 * height], (len(sensors), 1)), dtype=wp.vec2, device=device),
     )
-    return out
 
 
-def _weights_of(radiance: Any, sensors: Sequence[SensorModel]) -> F64:
-    """Return the weights of the levels of the pyramid of each image [B, levels]."""
-    height, width = radiance.shape[1:]
-    return np.array([glare_weights(sensor, height, width) for sensor in sensors])
+@lru_cache(maxsize=32)
+def _pyramid_tables(size: int, levels: int, device: str) -> tuple[Any, ...]:
+    """Return the weights of an axis, see `pyramid_weights`, on a device."""
+    return tuple(
+        wp.array(weights.astype(np.float32), dtype=float, device=device) for weights in pyramid_weights(size, levels)
+    )
 
 
-def _scattered(radiance: Any, sensors: Sequence[SensorModel], weights: F64) -> Any:
+def _scattered(radiance: Any, sensors: Sequence[SensorModel]) -> Any:
     """Return the light that lenses scatter and mirror, at half the size of the image."""
     device, (count, height, width) = radiance.device, radiance.shape
     levels = level_count(height, width)
+    tables = _lens_tables(tuple(sensors), height, width, str(device))
     pyramid = [radiance]
     for row_weights, column_weights in zip(
-        pyramid_weights(height, levels), pyramid_weights(width, levels), strict=True
+        _pyramid_tables(height, levels, str(device)), _pyramid_tables(width, levels, str(device)), strict=True
     ):
         half = wp.empty((count, len(row_weights), len(column_weights)), dtype=wp.vec3, device=device)
-        taps = [
-            wp.array(values.astype(np.float32), dtype=float, device=device) for values in (row_weights, column_weights)
-        ]
-        wp.launch(kernels.shrink, dim=half.shape[:2], inputs=[pyramid[-1], *taps], outputs=[half], device=device)
+        inputs = [pyramid[-1], row_weights, column_weights]
+        wp.launch(kernels.shrink, dim=half.shape[:2], inputs=inputs, outputs=[half], device=device)
         pyramid.append(half)
     ghost_level, scattered = min(GHOST_LEVEL, levels), pyramid[-1]
     for level in range(levels, 0, -1):
         total = wp.empty(pyramid[level].shape, dtype=wp.vec3, device=device)
-        shares = wp.array(weights[:, level - 1].astype(np.float32), dtype=float, device=device)
-        inputs = [pyramid[level], scattered, shares, float(level < levels)]
+        inputs = [pyramid[level], scattered, tables.weights, level - 1, float(level < levels)]
         wp.launch(kernels.gather, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
-        if level == ghost_level and any(sensor.flare > 0.0 for sensor in sensors):
+        if level == ghost_level and tables.ghosts is not None:
             source = ghost_source_level(height, width)
-            rows: Any = np.array([ghost_lights(sensor) for sensor in sensors], kernels.Ghost.numpy_dtype())  # type: ignore[attr-defined]
-            centres = wp.array(np.tile([0.5 * width, 0.5 * height], (count, 1)), dtype=wp.vec2, device=device)
-            inputs = [
-                pyramid[source],
-                wp.array(rows, dtype=kernels.Ghost, device=device),
-                centres,
-                float(2**level),
-                float(2**source),
-            ]
+            inputs = [pyramid[source], tables.ghosts, tables.centres, float(2**level), float(2**source)]
             wp.launch(kernels.add_ghosts, dim=total.shape[:2], inputs=inputs, outputs=[total], device=device)
         scattered = total
     return scattered
@@ -317,7 +340,7 @@ def add_glow(
         lanes,
     ]
     wp.launch(lamp_glow.take_lamps, dim=(*source.shape[:2], lanes), inputs=inputs, outputs=[source], device=device)
-    scattered = _scattered(source, sensors, _weights_of(source, sensors))
+    scattered = _scattered(source, sensors)
     lamp_shares = np.array([light[8] * sensor.scatters for sensor, light in zip(sensors, lights, strict=True)])
     inputs = [scattered, wp.array(lamp_shares.astype(np.float32), dtype=float, device=device)]
     wp.launch(kernels.add_enlarged, dim=source.shape[:2], inputs=inputs, outputs=[radiance], device=device)

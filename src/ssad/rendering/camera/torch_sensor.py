@@ -47,6 +47,7 @@ from ssad.rendering.camera.texture import Taps
 from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compress, extend_border, quantisation
 
 TOP = 0.99975 * BRIGHTEST  # light at which the curve is cut off
+PART_LEVELS = 4  # halvings of a part of an image, from which on its glare is that of the whole image
 
 # ---------------------------------------------------------------- from light to colour
 
@@ -142,41 +143,128 @@ def scatter(light: Tensor, sensor: SensorModel) -> Tensor:
     sensor.check_size(height, width)
     levels, weights = level_count(height, width), glare_weights(sensor, height, width)
     image = light.permute(0, 3, 1, 2)
-    pyramid = [image]
-    for rows, columns in zip(
-        _halving_matrices(height, levels, light.device, light.dtype),
-        _halving_matrices(width, levels, light.device, light.dtype),
-        strict=True,
-    ):
-        pyramid.append(rows @ pyramid[-1] @ columns.T)
+    pyramid = _halve([image], (height, width), range(levels))
     ghost_level = min(GHOST_LEVEL, levels)
-    scattered = pyramid[-1] * float(weights[-1])
+    scattered = torch.zeros_like(pyramid[-1])
     for level in range(levels, 0, -1):
-        if level < levels:
-            scattered = _enlarge(scattered, *pyramid[level].shape[2:]) + pyramid[level] * float(weights[level - 1])
+        scattered = _add_level(scattered, pyramid[level], float(weights[level - 1]))
         if level == ghost_level and sensor.flare > 0:
-            scattered = scattered + _ghosts(pyramid, level, sensor)
+            source, corner = (
+                pyramid[ghost_source_level(height, width)],
+                torch.zeros((len(light), 2), device=light.device),
+            )
+            scattered = scattered + _ghosts(source, sensor, (height, width), scattered.shape[2:], corner)
     behind = image * direct_share(sensor, weights) + _enlarge(scattered, height, width)
     return behind.permute(0, 2, 3, 1)
 
 
-def _ghosts(pyramid: Sequence[Tensor], level: int, sensor: SensorModel) -> Tensor:
-    """Return the ghosts of an image at a level of its pyramid, [B, 3, h, w]."""
-    height, width = pyramid[0].shape[2:]
-    source_level = ghost_source_level(height, width)
-    source, (rows, columns) = pyramid[source_level], pyramid[level].shape[2:]
-    total = torch.zeros_like(pyramid[level])
-    for size, tint in ghost_lights(sensor):
-        coordinates = []
-        for count, extent, source_count in ((columns, width, source.shape[3]), (rows, height, source.shape[2])):
-            place = (torch.arange(count, dtype=source.dtype, device=source.device) + 0.5) * 2**level
-            place = ((place - 0.5 * extent) / size + 0.5 * extent) / 2**source_level
-            # From pixels to the -1 to 1 of `grid_sample`.
-            coordinates.append(2 * place / source_count - 1)
-        grid = torch.stack(torch.meshgrid(*coordinates, indexing="xy"), -1)[None].expand(len(source), -1, -1, -1)
-        ghost = grid_sample(source, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-        total = total + ghost * source.new_tensor(tint)[:, None, None]
-    return total
+def scatter_parts(
+    light: Tensor, sensor: SensorModel, corners: Sequence[tuple[int, int]], image_size: tuple[int, int]
+) -> Tensor:
+    """Return the light of parts of images behind the lens, as `scatter` does of images that are dark elsewhere.
+
+    It is the same where the light is 2^`PART_LEVELS` px or more from the border of its part, unless that is the border
+    of the image.
+
+    Args:
+        light: Linear, [B, h, w, 3].
+        sensor: Sensor with glare, flare and focal length.
+        corners: First row and column of each part, multiples of 2^`PART_LEVELS`.
+        image_size: Height and width of the images, px.
+
+    Returns:
+        The same shape; the light itself without glare and flare.
+    """
+    if not sensor.scatters:
+        return light
+    levels, weights = level_count(*image_size), glare_weights(sensor, *image_size)
+    source_level = ghost_source_level(*image_size)
+    part_levels = min(PART_LEVELS, source_level)
+    image = light.permute(0, 3, 1, 2)
+    pyramid = _halve([image], light.shape[1:3], range(part_levels))
+    # From there on the light reaches far, so the levels are those of the whole images.
+    sides = [len(pyramid_weights(side, part_levels)[-1]) for side in image_size]
+    coarse = pyramid[-1].new_zeros((len(light), *sides, 3))
+    first_pixels = torch.tensor(corners).to(light.device)
+    first_cells = first_pixels // 2**part_levels
+    rows, columns = (
+        first_cells[:, axis, None] + torch.arange(pyramid[-1].shape[2 + axis], device=light.device) for axis in (0, 1)
+    )
+    cells = torch.arange(len(light), device=light.device)[:, None, None], rows[:, :, None], columns[:, None, :]
+    coarse = coarse.index_put(cells, pyramid[-1].permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    coarse_pyramid = _halve([coarse], image_size, range(part_levels, levels))
+    scattered = torch.zeros_like(coarse_pyramid[-1])
+    for level in range(levels, part_levels - 1, -1):
+        scattered = _add_level(scattered, coarse_pyramid[level - part_levels], float(weights[level - 1]))
+    scattered = scattered.permute(0, 2, 3, 1)[cells].permute(0, 3, 1, 2)
+    for level in range(part_levels - 1, 0, -1):
+        scattered = _add_level(scattered, pyramid[level], float(weights[level - 1]))
+        if level == GHOST_LEVEL and sensor.flare > 0:
+            source = coarse_pyramid[source_level - part_levels]
+            scattered = scattered + _ghosts(source, sensor, image_size, scattered.shape[2:], first_pixels)
+    behind = image * direct_share(sensor, weights) + _enlarge(scattered, *light.shape[1:3])
+    return behind.permute(0, 2, 3, 1)
+
+
+def _halve(pyramid: list[Tensor], size: Sequence[int], levels: range) -> list[Tensor]:
+    """Return a pyramid with further levels of images [B, C, h, w], whose level 0 has a size."""
+    height, width = size
+    matrices = zip(
+        *(_halving_matrices(side, levels.stop, pyramid[0].device, pyramid[0].dtype) for side in (height, width)),
+        strict=True,
+    )
+    for rows, columns in list(matrices)[levels.start :]:
+        pyramid.append(rows @ pyramid[-1] @ columns.T)
+    return pyramid
+
+
+def _add_level(scattered: Tensor, level: Tensor, weight: float) -> Tensor:
+    """Return the scattered light of a level and of the next, coarser one, enlarged."""
+    if scattered.shape != level.shape:
+        scattered = _enlarge(scattered, *level.shape[2:])
+    return scattered + level * weight
+
+
+def _ghosts(
+    source: Tensor, sensor: SensorModel, image_size: Sequence[int], shown_size: Sequence[int], corners: Tensor
+) -> Tensor:
+    """Return the ghosts of images in parts of them, [B, 3, h, w], at the level `GHOST_LEVEL` of a pyramid.
+
+    Args:
+        source: Level of the pyramid of the images whose blur ghosts have, [B, 3, ...].
+        sensor: Sensor with flare.
+        image_size: Height and width of the images, px.
+        shown_size: h and w, pixels of the level.
+        corners: First row and column of each part, px of the image [B, 2].
+    """
+    level = min(GHOST_LEVEL, level_count(*image_size))
+    source_level = ghost_source_level(*image_size)
+    sizes, tints = _ghost_constants(sensor, source.device, source.dtype)
+    coordinates = []
+    for axis in (0, 1):
+        places = (torch.arange(shown_size[axis], dtype=source.dtype, device=source.device) + 0.5) * 2**level
+        centre = 0.5 * image_size[axis]
+        places = ((places + corners[:, axis, None] - centre) / sizes + centre) / 2**source_level
+        # From pixels to the -1 to 1 of `grid_sample`.
+        coordinates.append(2 * places / source.shape[2 + axis] - 1)
+    rows, columns = coordinates
+    # All ghosts at once: few operations take little time on a GPU.
+    shape = (len(sizes), len(source), *shown_size)
+    grid = torch.stack([columns[:, :, None].expand(shape), rows[:, :, :, None].expand(shape)], -1).flatten(0, 1)
+    sources = source.expand(len(sizes), *source.shape).flatten(0, 1)
+    ghosts = grid_sample(sources, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    ghosts = ghosts.reshape(*shape[:2], *ghosts.shape[1:])
+    return (ghosts * tints).sum(0)
+
+
+@lru_cache(maxsize=8)
+def _ghost_constants(sensor: SensorModel, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return the sizes of the ghosts of a sensor [G, 1, 1], and their tints [G, 1, 3, 1, 1]."""
+    sizes, tints = zip(*ghost_lights(sensor), strict=True)
+    return (
+        _constant_tensor(np.array(sizes)[:, None, None], device, dtype),
+        _constant_tensor(np.array(tints)[:, None, :, None, None], device, dtype),
+    )
 
 
 def photosites(light: Tensor, sensor: SensorModel) -> Tensor:
@@ -446,6 +534,7 @@ class ChangedWindow:
         *,
         quality: int | None = None,
         subsampling: str = "420",
+        step: int = 1,
     ) -> ChangedWindow:
         """Return the window that changes when the radiance of pixels does.
 
@@ -455,6 +544,7 @@ class ChangedWindow:
             sensor: Sensor of the images.
             quality: Of JPEG, 1 to 100; None for images that are not compressed.
             subsampling: Of JPEG, "420" or "444".
+            step: See `of`.
 
         Returns:
             The window; it is empty in images without such a pixel.
@@ -474,7 +564,7 @@ class ChangedWindow:
                 for span, limit in zip(spans, (height, width), strict=True)
             )
             changed.append((rows, columns))
-        return ChangedWindow.of(changed, shape, sensor, quality=quality, subsampling=subsampling)
+        return ChangedWindow.of(changed, shape, sensor, quality=quality, subsampling=subsampling, step=step)
 
     @staticmethod
     def of(
@@ -484,6 +574,7 @@ class ChangedWindow:
         *,
         quality: int | None = None,
         subsampling: str = "420",
+        step: int = 1,
     ) -> ChangedWindow:
         """Return the window that gives the developed values of rectangles.
 
@@ -493,6 +584,8 @@ class ChangedWindow:
             sensor: Sensor of the images.
             quality: Of JPEG, 1 to 100; None for images that are not compressed.
             subsampling: Of JPEG, "420" or "444".
+            step: Rectangles that are read extend as many px farther than they must, and begin and end at its multiples
+                (see `scatter_parts`).
 
         Returns:
             The window.
@@ -514,8 +607,9 @@ class ChangedWindow:
             ]
             blocks = _equal_spans(blocks, padded_limit, block_side)
             coded.append(blocks)
-            needed = [_grow_span((first, min(last, limit)), sensor.reach, limit) for first, last in blocks]
-            read.append(_equal_spans(needed, limit, 2 if sensor.mosaic else 1))
+            margin = sensor.reach + (step if step > 1 else 0)
+            needed = [_grow_span((first, min(last, limit)), margin, limit) for first, last in blocks]
+            read.append(_equal_spans(needed, limit, max(step, 2 if sensor.mosaic else 1)))
         return ChangedWindow(
             (count, height, width),
             sensor,

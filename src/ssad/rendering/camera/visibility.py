@@ -132,17 +132,52 @@ def sun_map(  # noqa: PLR0917
     result.keys = VisibilityPass(scene, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples
     if soft[1] > 0:
         result.hardest, result.search = soft
-        block = 2 * result.search
-        count = size // block
-        blocks, result.blocks = (
-            wp.empty((len(middles), count, count), dtype=wp.vec2, device=scene.device) for _ in range(2)
-        )
-        lanes = 1 if scene.device == "cpu" else count
-        dim = (len(middles), count, lanes)
-        inputs = [result.keys, block, lanes]
-        wp.launch(shadow.gather_blocks, dim=dim, inputs=inputs, outputs=[blocks], device=scene.device)
-        wp.launch(shadow.join_blocks, dim=dim, inputs=[blocks, lanes], outputs=[result.blocks], device=scene.device)
+        result.blocks = _square_blocks(result.keys, 2 * result.search)
     return result
+
+
+def _square_blocks(keys: Any, block: int) -> Any:
+    """Return the depths nearest to and farthest from the sun in squares of four blocks of a shadow map.
+
+    Args:
+        keys: Shadow map [B, size, size], a Warp array.
+        block: Texels along each side of a block; a divisor of the size.
+
+    Returns:
+        [B, n, n], a Warp array of vec2 on the device of the map; n blocks lie along a side.
+    """
+    device, count = keys.device, keys.shape[1] // block
+    if device.is_cpu:
+        # Reductions of NumPy take a fifth of the time of the kernels, and give the same bits.
+        return wp.array(block_depths(keys.numpy(), block), dtype=wp.vec2, device=device)
+    blocks, square_blocks = (wp.empty((len(keys), count, count), dtype=wp.vec2, device=device) for _ in range(2))
+    dim = (len(keys), count, count)
+    wp.launch(shadow.gather_blocks, dim=dim, inputs=[keys, block, count], outputs=[blocks], device=device)
+    wp.launch(shadow.join_blocks, dim=dim, inputs=[blocks, count], outputs=[square_blocks], device=device)
+    return square_blocks
+
+
+def block_depths(keys: Any, block: int) -> F32:
+    """Return the depths nearest to and farthest from the sun in squares of four blocks of a shadow map.
+
+    Args:
+        keys: Shadow map uint64 [B, size, size], see `ssad.rendering.camera.kernels.raster`.
+        block: Texels along each side of a block; a divisor of the size.
+
+    Returns:
+        Thousands of metres towards the sun [B, n, n, 2], for the square that begins at each of n by n blocks.
+    """
+    count = keys.shape[1] // block
+    depths = np.empty((len(keys), count, count, 2), np.float32)
+    for index, extreme in enumerate((np.maximum, np.minimum)):
+        rows = extreme.reduce(keys.reshape(len(keys), count, block, count * block), axis=2)
+        extremes = rows[..., ::block].copy()
+        for column in range(1, block):
+            extreme(extremes, rows[..., column::block], out=extremes)
+        extremes[:, :-1] = extreme(extremes[:, :-1], extremes[:, 1:])
+        extremes[..., :-1] = extreme(extremes[..., :-1], extremes[..., 1:])
+        depths[..., index] = (extremes >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    return depths
 
 
 def empty_sun_map(scene: RenderScene) -> Any:

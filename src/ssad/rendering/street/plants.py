@@ -70,9 +70,16 @@ BALL, BALL_FACES = _icosahedron()
 
 
 def blob(
-    centre: F64, radius: F64, material: int, materials: TownMaterials, *, levels: int, rough: float = 0.14, key: str = ""
+    centre: F64,
+    radius: F64,
+    material: int,
+    materials: TownMaterials,
+    *,
+    levels: int,
+    rough: float = 0.14,
+    key: str = "",
 ) -> TrianglePiece:
-    """An uneven ellipsoid of 20 triangles, shaded smooth; with a `key`, its form takes no draw from the town's generator."""
+    """An uneven ellipsoid of 20 triangles, shaded smooth; with a `key`, its form takes none of the town's draws."""
     rng = generator(key, *centre.tolist(), *radius.tolist()) if key else materials.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)

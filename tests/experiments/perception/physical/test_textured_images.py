@@ -17,7 +17,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import ssad.experiments.perception.physical.textured_images as module
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.experiments.perception.physical.textured_images import KEPT, PreparedImage, texturable_images
+from ssad.experiments.perception.physical.textured_images import (
+    KEPT,
+    PreparedImage,
+    parse_part,
+    texturable_images,
+    visible_part,
+)
 from ssad.recorders.nuscenes import SENSOR
 from ssad.recorders.target_images import TARGET, record_target_images, recorded_views
 from ssad.recorders.target_recording import TargetRecording
@@ -30,6 +36,7 @@ from ssad.rendering.camera.scene_edit import render_with
 from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg
 from ssad.rendering.camera.torch_sensor import develop
+from ssad.rendering.hours import at_hour
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical.textures.carrier import RoadPatch
 
@@ -179,16 +186,16 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
         next(texturable_images(folder, LAYERS))
 
 
-def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
+def test_pictures_are_the_same_alone_and_together(glowing: Path) -> None:
     """With windows of unlike sizes, one at the border of the picture, each with a texture and noise of its own."""
-    clip = next(texturable_images(folder, LAYERS))
+    clip = next(texturable_images(glowing, LAYERS))
     fragments, width = clip.fragments, clip.radiance.shape[1]
     least = int(fragments["place"].min()) // width
     few = replace(clip, fragments=fragments[fragments["place"] < (least + 20) * width])
     down = clip.image.shape[0] - clip.corner[0] - clip.radiance.shape[0]
     low = replace(clip, corner=(clip.corner[0] + down, clip.corner[1]), image=np.roll(clip.image, down, 0))
-    ready = [one.prepare(SIZES) for one in (clip, few, low)]
-    assert len({tuple(one.part.shape) for one in ready}) == 3
+    ready = [one.prepare(SIZES, glow=False) for one in (clip, few, low)]
+    assert len({tuple(one.part.shape) for one in ready}) > 1
     textures = [{k: (v * share).requires_grad_() for k, v in colours().items()} for share in (1.0, 0.5, 0.8)]
 
     def draws(k: int) -> torch.Generator:
@@ -222,9 +229,9 @@ class Counted(TorchDispatchMode):
         return found
 
 
-def test_a_further_picture_costs_few_operations(folder: Path) -> None:
+def test_a_further_picture_costs_few_operations(glowing: Path) -> None:
     """What bounds a step on a GPU is how many operations are started, not how large they are."""
-    ready = next(texturable_images(folder, LAYERS)).prepare(SIZES)
+    ready = next(texturable_images(glowing, LAYERS)).prepare(SIZES)
     counts = []
     for number in (1, 2, 6):
         textures = {k: v.expand(number, *v.shape).clone().requires_grad_() for k, v in colours().items()}
@@ -259,6 +266,26 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     whole = jpeg(develop(radiance, float(anew.exposure[0]), SENSOR, torch.tensor(noise)[None]), 92)
     changed = torch.as_tensor(brighter)
     torch.testing.assert_close(white[..., changed], whole[..., changed], rtol=0, atol=1e-5)
+
+
+def test_at_night_the_glow_of_a_texture_is_part_of_the_picture(glowing: Path) -> None:
+    """Head lamps light the car; what the lens scatters of it shows far around it."""
+    (seen,) = recorded_views(glowing, hour=lambda weather, heading: at_hour(weather, "night", heading))
+    worn = seen.with_layers(LAYERS[0])
+    picture = render(seen.scene, [worn], quality=seen.quality)
+    (top, bottom), (left, right) = parse_part(visible_part(picture, worn))["glow"]
+    touched = np.divmod(picture.fragments["place"].astype(np.int64), 160)
+    assert bottom - top > np.ptp(touched[0]) + 10
+    assert right - left > np.ptp(touched[1]) + 10
+    radiance, taps = torch.tensor(picture.radiance), texture_taps(picture, 32)
+    lens, exposure = with_lens_effects(SENSOR, picture.effects), float(picture.exposure[0])
+    black, white = (
+        develop(retexture(taps, torch.full((3, 32, 32), value), radiance), exposure, lens) for value in (0.0, 1.0)
+    )
+    change = (white - black)[0].amax(0)
+    change[top:bottom, left:right] = 0.0
+    # One in the light; the mosaic amplifies differences between neighbours.
+    assert 0.0 < float(change.max()) < 6.0 / 255.0
 
 
 def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:

@@ -16,7 +16,7 @@ from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import RecordedTargetImages, drive_of, target_truth
-from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturableImage, visible_part
+from ssad.experiments.perception.physical.textured_images import BLOCK, TexturableImage, parse_part, visible_part
 from ssad.recorders.target_images import TARGET, RecordedView, image_rows, recorded_views
 from ssad.rendering.camera.glare import with_lens_effects
 from ssad.rendering.camera.render import SceneWeather, render
@@ -27,6 +27,7 @@ from ssad.scenarios.static.physical.lights.light import TargetSize
 from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitImage, render_lit_image
 
 QUALITY: Final = 92  # of JPEG, as it is recorded
+ROOM: Final = 24  # px around the target that light on it can change, beyond half its box
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,20 +68,15 @@ class RelightableImage:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
         view = edit.on(self.view.view, TARGET)
         rendering = render(self.scene, [view], quality=self.view.quality)
-        visible = visible_part(rendering, view)
-        corner = int(visible["corner"][0]), int(visible["corner"][1])
+        sensor = with_lens_effects(view.sensor, rendering.effects)
         image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
         return TexturableImage(
             self.view.file,
             self.view.row,
             self.view.objects,
             image,
-            corner,
-            visible["radiance"],
-            float(visible["exposure"]),
-            visible["fragments"],
-            with_lens_effects(view.sensor, rendering.effects),
-            visible["noise"],
+            sensor=sensor,
+            **parse_part(visible_part(rendering, view)),
         )
 
     def lit(self, device: str | torch.device = "cpu") -> LitImage:
@@ -102,7 +98,7 @@ def _part(view: RecordedView) -> tuple[slice, slice]:
     """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
     (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in view.objects if annotation["target"])
     height, width = view.view.camera.height, view.view.camera.width
-    half_extent = max(box_width, box_height) / 2 + MARGIN / 2
+    half_extent = max(box_width, box_height) / 2 + ROOM
     slices = []
     for start, extent, limit in ((y, box_height, height), (x, box_width, width)):
         first_pixel = max(int(start - half_extent), 0) // BLOCK * BLOCK

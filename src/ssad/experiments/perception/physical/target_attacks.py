@@ -172,7 +172,11 @@ class TrainedTexture(Perturbation):
             image_sets = [attacks.images(recording, spec.pair["train_images"], spec.source)]
             if spec.around:
                 image_sets.append(attacks.images(f"{spec.pair['train']}-around", spec.around, spec.source))
-            return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
+            return [
+                view
+                for image_set in image_sets
+                for _, view in image_set.wearing(surface, solid=image_set.whole, glow=False)
+            ]
 
         base_paint = paint_under(attacks.target, spec.surface)
         return attacks.textures.texture(

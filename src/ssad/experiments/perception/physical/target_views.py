@@ -62,13 +62,16 @@ class RecordedTargetImages:
                 target_truth(row, objects, self.classes, whole=self.whole),
             )
 
-    def wearing(self, surface: TextureSurface, *, solid: bool = False) -> Iterator[tuple[str, TextureView]]:
+    def wearing(
+        self, surface: TextureSurface, *, solid: bool = False, glow: bool = True
+    ) -> Iterator[tuple[str, TextureView]]:
         """Yield drive and image with a target that is ready for a texture, one after another.
 
         Args:
             surface: Surface of the texture on the target.
             solid: Whether the truth is the target alone, with its 3D box, as a training against a 3D detector
                 needs.
+            glow: See `TexturableImage.prepare`; trainings do without.
 
         Raises:
             FormatError: The folder holds no recording of this version.
@@ -76,7 +79,7 @@ class RecordedTargetImages:
         """
         is_visible = False
         for textured in islice(texturable_images(self.folder, (surface.layer,), device=self.device), self.count):
-            prepared = textured.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
+            prepared = textured.prepare({0: surface.size}, masks={0: surface.mask}, glow=glow, device=self.device)
             is_visible |= bool(len(prepared.taps[0].pixel))
             truth = target_truth(textured.row, textured.objects, self.classes, whole=self.whole)
             yield drive_of(textured.row), TextureView(prepared, solid_target(textured.row, truth) if solid else truth)

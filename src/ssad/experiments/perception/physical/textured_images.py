@@ -30,11 +30,21 @@ from ssad.rendering.camera.render import Rendering, View, render, view_noise
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
-from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generators_on_device
+from ssad.rendering.camera.torch_sensor import (
+    PART_LEVELS,
+    ChangedWindow,
+    Rectangle,
+    curve,
+    generators_on_device,
+    scatter,
+    scatter_parts,
+)
 
+VISIBLE = 1.0 / 255.0  # change of a value from which on the glow of a texture counts
 KEPT = ".seen"  # folder of a recording for what has been rendered
-MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
+MARGIN = 80  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
+STEP = 2**PART_LEVELS  # px at whose multiples windows begin, so that glare does not depend on them
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +57,14 @@ class TexturableImage:
         objects: What is annotated in it (see `RecordedView`).
         image: As recorded, uint8 RGB [H, W, 3].
         corner: Row and column at which `radiance` begins in it.
-        radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
+        radiance: Behind the lens, of the part around what wears the textures, linear, textured pixels without them
+            [h, w, 3].
         exposure: What radiance is multiplied by.
         fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
         sensor: Sensor of the camera, with the effects of its lens.
         noise: Noise of the photosites of the part in standard deviations [h, w]; None if there is none.
+        glow: Rows and columns of the picture in which light from the textures, scattered by the lens, can change a code
+            by more than one.
     """
 
     file: str
@@ -63,6 +76,7 @@ class TexturableImage:
     exposure: float
     fragments: Any
     sensor: SensorModel
+    glow: Rectangle
     noise: F32 | None = None
 
     def prepare(
@@ -71,6 +85,7 @@ class TexturableImage:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
+        glow: bool = True,
         device: str | torch.device = "cpu",
     ) -> PreparedImage:
         """Prepare the image for textures of certain sizes.
@@ -79,6 +94,8 @@ class TexturableImage:
             sizes: Number of each texture -> its height and width, or one side, texels. It must cover all textures.
             masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
             quality: JPEG quality, as recorded; None: no compression.
+            glow: Whether the light that the lens scatters of the textures reaches as far as it can be seen, at night
+                over the whole picture; False: no farther than a few pixels, which takes less time and memory.
             device: Device of the images.
 
         Raises:
@@ -99,14 +116,20 @@ class TexturableImage:
             for number, texture_size in sizes.items()
         }
         touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
-        window = ChangedWindow.around(touched_pixels, (1, height, width), self.sensor, quality=quality)
+        if glow and len(touched_pixels):
+            (first_row, last_row), (first_column, last_column) = self.glow
+            corners = [first_row * width + first_column, (last_row - 1) * width + last_column - 1]
+            touched_pixels = torch.cat([touched_pixels, torch.tensor(corners)])
+        behind_lens = replace(self.sensor, glare=0.0, flare=0.0)
+        window = ChangedWindow.around(touched_pixels, (1, height, width), behind_lens, quality=quality, step=STEP)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
         device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
         noise = None
         if self.noise is not None:
             noise = _cut(torch.tensor(self.noise), rectangle, window.read[0]).to(device)
-        return PreparedImage(window, radiance.to(device), self.exposure, device_taps, recorded_image, noise)
+        part = radiance.to(device)
+        return PreparedImage(window, part, self.exposure, device_taps, recorded_image, self.sensor, noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +138,11 @@ class PreparedImage:
 
     Attributes:
         window: Part of the image that is developed anew.
-        part: Radiance that the window reads, without the textures [h, w, 3].
+        part: Radiance behind the lens that the window reads, without the textures [h, w, 3].
         exposure: Factor on the radiance.
         taps: Contribution of each texture to the pixels of the image, by its number.
         before: The whole image as recorded, uint8 [3, H, W].
+        lens: Sensor of the camera, with the effects of its lens.
         noise: Noise of the photosites of the part, as recorded [h, w]; None if there is none.
     """
 
@@ -127,6 +151,7 @@ class PreparedImage:
     exposure: float
     taps: Mapping[int, Taps]
     before: Tensor
+    lens: SensorModel
     noise: Tensor | None = None
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
@@ -167,7 +192,7 @@ class PreparedImage:
 
     @staticmethod
     def lit(pictures: Sequence[PreparedImage], textures: Mapping[int, Tensor]) -> tuple[Tensor, ChangedWindow]:
-        """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
+        """The first half of `together`: radiance [B, h, w, 3] behind the lens that a window of all pictures reads."""
         first_window, batch_size = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
         if missing:
@@ -180,18 +205,20 @@ class PreparedImage:
                 first_window.sensor,
                 quality=first_window.quality,
                 subsampling=first_window.subsampling,
+                step=STEP,
             )
-        (rows, columns), (_, _, image_width) = window.read[0], first_window.shape
+        (rows, columns), (_, image_height, image_width) = window.read[0], first_window.shape
         window_size = rows[1] - rows[0], columns[1] - columns[0]
         radiance = pictures[0].part.new_zeros((batch_size, *window_size, 3))
+        texture_light = torch.zeros_like(radiance)
         for window_radiance, prepared, read_rectangle in zip(radiance, pictures, window.read, strict=True):
             target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
             window_radiance[target_slices] = prepared.part[source_slices]
         corners = [(read_rectangle[0][0], read_rectangle[1][0]) for read_rectangle in window.read]
         for layer in pictures[0].taps:
             taps = combine_taps([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
-            radiance = retexture(taps, textures[layer], radiance)
-        return radiance, window
+            texture_light = retexture(taps, textures[layer], texture_light)
+        return radiance + scatter_parts(texture_light, pictures[0].lens, corners, (image_height, image_width)), window
 
     @staticmethod
     def developed(
@@ -287,13 +314,10 @@ def texturable_images(
         if file in missing_files:
             safeio.make_folder(cache_folder)
             # The views come in the order of the rows, so the next one belongs to this row.
-            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers))
+            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers, device))
         cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
-        corner = int(cached["corner"][0]), int(cached["corner"][1])
-        exposure = float(cached["exposure"])
-        radiance, fragments, noise = cached["radiance"], cached["fragments"], cached["noise"]
-        yield TexturableImage(file, row, objects, image, corner, radiance, exposure, fragments, sensor, noise)
+        yield TexturableImage(file, row, objects, image, sensor=sensor, **parse_part(cached))
 
 
 def recorded_sensor(folder: Path, split: str = "all") -> SensorModel:
@@ -344,7 +368,7 @@ def cache_texture_images(
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():
-                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers))
+                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers, device))
 
 
 def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
@@ -354,38 +378,66 @@ def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], s
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def visible_part(picture: Rendering, view: View) -> dict[str, Any]:
-    """What is kept of one rendered picture of a view: the part around what shows textures."""
+def visible_part(picture: Rendering, view: View, device: str = "cpu") -> dict[str, Any]:
+    """Return arrays of the part of a rendered view around what shows textures, see `parse_part`.
+
+    It is behind the lens, which scatters the light of the whole picture.
+    """
     height, width = picture.radiance.shape[1:3]
-    rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
-    (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
-    if with_lens_effects(SENSOR, picture.effects).scatters:
-        # The lens carries light from everywhere to everywhere.
-        (top, bottom), (left, right) = (0, height), (0, width)
     noise = view_noise(view)
     assert noise is not None
     fragments = picture.fragments.copy()
+    light = torch.from_numpy(picture.radiance[:1]).to(device)
+    lens = with_lens_effects(view.sensor, picture.effects)
+    background = scatter(light, lens)
+    places = torch.from_numpy(fragments["place"].astype(np.int64)).to(device)
+    white = torch.from_numpy(np.ascontiguousarray(fragments["light"], np.float32)).to(device)
+    texture_light = torch.zeros_like(light).reshape(-1, 3).index_add(0, places, white).reshape(light.shape)
+    exposure = float(picture.exposure[0])
+    # A white texture gives most light, and a dark background shows it best.
+    change = curve((background + scatter(texture_light, lens)) * exposure) - curve(background * exposure)
+    is_changed = (change[0].amax(-1) > VISIBLE).reshape(-1).index_fill(0, places, True)
+    rows, columns = np.divmod(torch.nonzero(is_changed)[:, 0].cpu().numpy(), width)
+    glow = tuple((int(axis.min()), int(axis.max()) + 1) if len(axis) else (0, 0) for axis in (rows, columns))
+    (top, bottom), (left, right) = (_span(*pair) for pair in zip(glow, (height, width), strict=True))
+    rows, columns = np.divmod(fragments["place"].astype(np.int64), width)
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
         "corner": np.array([top, left]),
-        "radiance": picture.radiance[0, top:bottom, left:right],
+        "radiance": background[0, top:bottom, left:right].cpu().numpy(),
         "exposure": picture.exposure[0],
         "fragments": fragments,
+        "glow": np.array(glow),
         "noise": noise[top:bottom, left:right],
     }
 
 
-def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
+def parse_part(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a `TexturableImage` from the arrays of `visible_part`."""
+    rows, columns = arrays["glow"].tolist()
+    return {
+        "corner": (int(arrays["corner"][0]), int(arrays["corner"][1])),
+        "radiance": arrays["radiance"],
+        "exposure": float(arrays["exposure"]),
+        "fragments": arrays["fragments"],
+        "glow": (tuple(rows), tuple(columns)),
+        "noise": arrays["noise"],
+    }
+
+
+def _render_visible_part(
+    view: RecordedView, layers: Sequence[TextureLayer | TextureDecal], device: str
+) -> dict[str, Any]:
     dressed_view = view.with_layers(*layers)
-    return visible_part(render(view.scene, [dressed_view], quality=view.quality), dressed_view)
+    return visible_part(render(view.scene, [dressed_view], quality=view.quality), dressed_view, device)
 
 
-def _span(places: Any, limit: int) -> tuple[int, int]:
-    """Where a part begins and ends that holds all places and their margin; a block if there are none."""
-    if not len(places):
+def _span(span: tuple[int, int], limit: int) -> tuple[int, int]:
+    """Where a part begins and ends that holds a span and its margin; a block if it is empty."""
+    if span[0] == span[1]:
         return 0, min(BLOCK, limit)
-    start = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
-    return start, min(int(places.max()) + MARGIN + 1, limit)
+    start = max(span[0] - MARGIN, 0) // BLOCK * BLOCK
+    return start, min(span[1] + MARGIN, limit)
 
 
 def _layer_key(layer: TextureLayer | TextureDecal) -> tuple[object, ...]:

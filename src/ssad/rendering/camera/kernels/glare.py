@@ -66,13 +66,17 @@ def enlarged(image: wp.array3d(dtype=wp.vec3), view_index: int, y: int, x: int) 
 def gather(
     level: wp.array3d(dtype=wp.vec3),
     coarser: wp.array3d(dtype=wp.vec3),
-    weights: wp.array(dtype=float),
+    weights: wp.array2d(dtype=float),
+    row: int,
     coarser_share: float,
     out: wp.array3d(dtype=wp.vec3),
 ):
-    """Add a level of the pyramid times its weight [B] to the sum of the coarser ones (0: there is none)."""
+    """Add a level of the pyramid times its weight, a row of weights [levels, B], to the sum of the coarser ones.
+
+    coarser_share: 0 where there is none.
+    """
     view_index, y = wp.tid()
-    weight = weights[view_index]
+    weight = weights[row, view_index]
     for x in range(out.shape[2]):
         total = level[view_index, y, x] * weight
         if coarser_share > 0.0:
@@ -115,11 +119,13 @@ def add_ghosts(
                 row_index = int(wp.floor(source_y))
                 right_share = source_x - float(column)
                 lower_share = source_y - float(row_index)
-                upper = texel(source, view_index, row_index, column) * (1.0 - right_share)
-                upper += texel(source, view_index, row_index, column + 1) * right_share
-                lower = texel(source, view_index, row_index + 1, column) * (1.0 - right_share)
-                lower += texel(source, view_index, row_index + 1, column + 1) * right_share
-                total += wp.cw_mul(upper * (1.0 - lower_share) + lower * lower_share, ghost.light)
+                # Smaller images leave most of the picture dark.
+                if row_index >= -1 and column >= -1 and row_index < source.shape[1] and column < source.shape[2]:
+                    upper = texel(source, view_index, row_index, column) * (1.0 - right_share)
+                    upper += texel(source, view_index, row_index, column + 1) * right_share
+                    lower = texel(source, view_index, row_index + 1, column) * (1.0 - right_share)
+                    lower += texel(source, view_index, row_index + 1, column + 1) * right_share
+                    total += wp.cw_mul(upper * (1.0 - lower_share) + lower * lower_share, ghost.light)
         out[view_index, y, x] = total
 
 

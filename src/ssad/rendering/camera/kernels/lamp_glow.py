@@ -3,7 +3,7 @@
 import warp as wp
 
 from ssad.rendering.camera.kernels.light import lamp_emission
-from ssad.rendering.camera.kernels.raster import LAST, NONE
+from ssad.rendering.camera.kernels.raster import LAST
 from ssad.rendering.camera.kernels.shade import DrawRanges, Geometry, hit_of
 from ssad.rendering.camera.kernels.sky import Light, air_transmission
 
@@ -31,6 +31,8 @@ def take_lamps(
     view, y, lane = wp.tid()
     light = lights[view]
     share = 1.0 / float(scale * scale)
+    # Neighbours mostly show the same surface: what is no lamp is looked up once.
+    dark_key = wp.uint64(0)
     for x in range(lane, out.shape[2], lanes):
         total = wp.vec3(0.0, 0.0, 0.0)
         if is_glowing[view] == 1 and light.lamps > 0.0:
@@ -38,11 +40,13 @@ def take_lamps(
                 row = y * scale + sample / scale
                 column = x * scale + sample % scale
                 key = draw_samples.samples[view, row, column] & LAST
-                if key != NONE:
+                if key != dark_key:
                     slot = int(LAST - key)
                     owner = draw_samples.owners[slot / 2]
                     gain = gains[geometry.material[owner[1]]]
-                    if gain > 0.0:
+                    if gain <= 0.0:
+                        dark_key = key
+                    else:
                         focal = lens[view]
                         u = (float(column) + 0.5) / float(scale) - 0.5
                         v = (float(row) + 0.5) / float(scale) - 0.5

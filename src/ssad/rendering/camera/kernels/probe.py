@@ -20,7 +20,7 @@ class Probes:
 
     Attributes:
         is_on: 1 where surfaces mirror them.
-        size: Texels along an eighth of the horizon's square, at level 0.
+        size: Texels along an eighth of the horizon's square, at level 0; a power of two.
         texels: RGB, and one over the distance (1/m, 0 for the sky), of all levels of each probe, one after the other.
         row: Probe of each view.
         centre: Position of each probe, m.
@@ -86,9 +86,9 @@ def probe_texel(probes: Probes, probe: int, direction: wp.vec3, level: int) -> w
     row = wp.min(int(v), 2 * size - 2)
     u = u - float(column)
     v = v - float(row)
-    # The columns go around the horizon.
-    left = (column + width) % width
-    right = (column + 1) % width
+    # The columns go around the horizon; their number is a power of two.
+    left = column & (width - 1)
+    right = (column + 1) & (width - 1)
     upper = start + row * width
     lower = upper + width
     return (probes.texels[probe, upper + left] * (1.0 - u) + probes.texels[probe, upper + right] * u) * (1.0 - v) + (
@@ -116,20 +116,22 @@ def mirrored_light(probes: Probes, view: int, ray: wp.vec3, p: wp.vec3, roughnes
         beside = wp.dot(offset, offset) - along * along
         travel = float(0.0)
         for step in range(STEPS):
-            inverse = probe_texel(probes, probe, direction, lower)[3]
-            # What is 1 km away or further shows no parallax.
-            if inverse > 1.0e-3:
-                distance = 1.0 / inverse
-                # the point of the ray at this distance from the probe, or the nearest to it
-                reach = wp.max(wp.sqrt(wp.max(distance * distance - beside, 0.0)) - along, 0.01)
-                if step > 0:
-                    # Short steps do not jump to and fro between a surface and what is behind its edge.
-                    reach = 0.5 * (wp.min(reach, 2.0 * travel) + travel)
-                travel = reach
-            elif travel > 0.0:
-                travel = 1.5 * travel
-            if travel > 0.0:
-                direction = offset + ray * travel
+            # Without anything near along the ray, further steps would find the same.
+            if step == 0 or travel > 0.0:
+                inverse = probe_texel(probes, probe, direction, lower)[3]
+                # What is 1 km away or further shows no parallax.
+                if inverse > 1.0e-3:
+                    distance = 1.0 / inverse
+                    # the point of the ray at this distance from the probe, or the nearest to it
+                    reach = wp.max(wp.sqrt(wp.max(distance * distance - beside, 0.0)) - along, 0.01)
+                    if step > 0:
+                        # Short steps do not jump to and fro between a surface and what is behind its edge.
+                        reach = 0.5 * (wp.min(reach, 2.0 * travel) + travel)
+                    travel = reach
+                elif travel > 0.0:
+                    travel = 1.5 * travel
+                if travel > 0.0:
+                    direction = offset + ray * travel
     share = level - float(lower)
     texel = probe_texel(probes, probe, direction, lower)
     if share > 0.02:

@@ -238,7 +238,8 @@ def fill(
 
     Triangles whose extent has more than `largest` samples are listed in `large` instead while there is room.
 
-    twigs: of each face, see `Triangle`. owners: the draw and the face of each index. A parallel projection is the sun: the ground casts no shadow.
+    twigs: of each face, see `Triangle`. owners: the draw and the face of each index. A parallel projection is the sun:
+    the ground casts no shadow.
     Each draw has `lanes` threads, which take its faces in turn.
     """
     draw, lane = wp.tid()

@@ -7,7 +7,7 @@ lamps with their shadows and mirror images, cards with the sun's shadow maps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +21,7 @@ from ssad.rendering.camera.render import RenderQuality, View, render, scene_ligh
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
 from ssad.rendering.camera.sensor import SensorModel
-from ssad.rendering.camera.torch_sensor import develop
+from ssad.rendering.camera.torch_sensor import develop, scatter, scatter_parts
 
 BLIND: Final = ShadowCard(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))]))
 """Keeps the whole sun off a target."""
@@ -44,6 +44,7 @@ class LitImage:
         per_lux: Irradiance over pi of one lux (see `ssad.rendering.camera.photometry`).
         fog: Extinction, 1/m.
         sensor: Sensor of the camera.
+        scattered: The radiance behind the lens, which scatters the light of the whole image [h, w, 3].
         noise: Noise of the photosites of the crop in standard deviations [1, h, w]; None if there is none.
     """
 
@@ -59,6 +60,7 @@ class LitImage:
     per_lux: float
     fog: float
     sensor: SensorModel
+    scattered: Tensor
     noise: Tensor | None = None
 
     def show(self, change: Tensor) -> Tensor:
@@ -71,9 +73,13 @@ class LitImage:
             [N, 3, H, W] in 0 to 1, differentiable in the change.
         """
         noise = None if self.noise is None else self.noise.expand(len(change), -1, -1)
-        crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor, noise)
         (top, left), (height, width) = self.corner, self.radiance.shape[:2]
-        is_whole = (height, width) == self.before.shape[2:]
+        image_size = self.before.shape[2], self.before.shape[3]
+        change = torch.maximum(change, -self.radiance)
+        # What the lens scatters of the change beyond the crop is too little to see.
+        scattered = self.scattered + scatter_parts(change, self.sensor, [self.corner] * len(change), image_size)
+        crop = develop(scattered.clamp_min(0.0), self.exposure, replace(self.sensor, glare=0.0, flare=0.0), noise)
+        is_whole = (height, width) == image_size
         # At the border of the part the lens lacks what lies beyond it.
         margin = 4 if min(height, width) > 16 and not is_whole else 0
         full_images = self.before.repeat(len(change), 1, 1, 1)
@@ -109,9 +115,6 @@ def render_lit_image(
     """
     rendering = render(scene, [view], quality=quality, surface=True)
     sensor = with_lens_effects(view.sensor, rendering.effects)
-    if sensor.scatters:
-        # The lens carries light from everywhere to everywhere.
-        rows, columns = slice(0, view.camera.height), slice(0, view.camera.width)
     surface, crop = rendering.surface, (0, rows, columns)
     assert surface is not None
     pose = next(scene_object.pose for scene_object in view.objects if scene_object.tag == tag)
@@ -142,5 +145,6 @@ def render_lit_image(
         per_lux(view.weather),
         view.weather.fog,
         sensor,
+        scatter(on_device(rendering.radiance), sensor)[crop],
         None if noise is None else on_device(noise[rows, columns])[None],
     )

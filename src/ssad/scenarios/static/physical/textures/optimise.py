@@ -192,7 +192,9 @@ def train_texture(
     with steady(detector):
         for epoch in range(len(state.losses), attack.epochs):
             order = _order(attack, state.hard, generator("texture order", *key, epoch))
-            loss_sum, steepest = 0.0, 0.0
+            # Numbers stay on the device until the end of the epoch: each transfer from a GPU waits for all its work.
+            epoch_losses: list[Tensor] = []
+            steepest = texels.new_zeros(())
             for step, batch_start in enumerate(range(0, len(order), attack.batch)):
                 batch_indices = order[batch_start : batch_start + attack.batch]
                 colour = colour_of(texels)
@@ -211,14 +213,15 @@ def train_texture(
                     raise ConfigError(f"attack {attack.name}: the gradient is not finite in epoch {epoch + 1}")
                 if attack.decay > 0.0:
                     texels.grad += attack.decay * (texels.detach() - neutral)
-                steepest = max(steepest, float(texels.grad.square().sum(0).max().sqrt()))
+                steepest = torch.maximum(steepest, texels.grad.square().sum(0).max().sqrt())
                 optimiser.step()
                 with torch.no_grad():
                     texels.copy_(bounded(texels))
-                loss_sum += float(losses.detach().sum())
-                state.hard[batch_indices] = losses.detach().cpu().double().numpy()
-            state.losses.append(loss_sum / len(order))
-            state.gradients.append(steepest)
+                epoch_losses.append(losses.detach())
+            image_losses = torch.cat(epoch_losses).double().cpu().numpy()
+            state.hard[order] = image_losses
+            state.losses.append(float(image_losses.mean()))
+            state.gradients.append(float(steepest))
             if not any(state.gradients):  # in later epochs a zero gradient means that nothing is left to hide
                 raise ConfigError(
                     f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never "
