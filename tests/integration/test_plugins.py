@@ -16,6 +16,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+import numpy as np
 import pytest
 from helpers.photographs import write_list
 from helpers.quick import others_slow
@@ -29,7 +30,9 @@ from ssad.core.errors import ConfigError
 from ssad.core.registry import names
 from ssad.detectors import cached_detector
 from ssad.experiments.suites import KINDS, kind_of, load_suite
-from ssad.scenarios.static.catalogue import PerturbationEntry
+from ssad.rendering.camera.scene import SceneObject
+from ssad.rendering.sensor_suite import SensorSuite
+from ssad.scenarios.static.catalogue import PerturbationEntry, parse_perturbation
 
 Options = Mapping[str, Any]
 
@@ -483,6 +486,25 @@ def test_a_key_takes_the_object_of_a_package(package: Path, folder: Path, kind: 
     for form, changes in suites.items():
         edited = keys_of(folder, kind, changes)
         assert edited != keys[form], f"the source of {source.name} decides the results, and is in no key ({form})"
+
+
+def test_an_attack_of_a_user_on_signs_changes_them_in_the_loop(package: Path, folder: Path) -> None:
+    """The attack of the guide, as a module of the package."""
+    guide = (Path(__file__).parents[2] / "docs/how-to/attack-lane-keeping.md").read_text()
+    source = package / "signs.py"
+    source.write_text(guide.partition("```python\n")[2].partition("```")[0])
+    name = f"{PACKAGE}.signs:SlowDown"
+    system = {"name": "reads limits", "detector": "truth", "steers_by": "markings", "set_speed": 20.0}
+    changes = {"systems": [system], "perturbations": [name]}
+    keys = keys_of(folder, "gap", changes)
+    attack = parse_perturbation(name).make(1)
+    edit = attack.in_loop(SensorSuite(), target=0, victim=None, seed=0).street_edit
+    assert edit is not None
+    (key,) = edit.meshes()
+    shown = edit.objects((SceneObject(3, np.eye(4)),), np.zeros((2, 2)), {key: 8}, {3: "limit_sign:60"})
+    assert [entry.mesh for entry in shown] == [8]
+    source.write_text(source.read_text().replace('"20"', '"30"'))
+    assert len(keys_of(folder, "gap", changes) & keys) == len(keys) - 1, "the cell of the attack has another key"
 
 
 @pytest.fixture(scope="session")

@@ -59,6 +59,14 @@ def test_bodies_are_added_and_signs_are_replaced_or_gone() -> None:
     np.testing.assert_allclose(changed[-1].pose[:2, 3], (5.0, -2.0))
 
 
+def test_signs_of_one_limit_change_before_those_of_every_limit() -> None:
+    street = StreetEdit(signs={"limit_sign:30": None, "limit_sign": SCREEN})
+    (key,) = street.meshes()
+    kinds = {1: "limit_sign:30", 2: "limit_sign:50", 3: "yield_sign"}
+    changed = street.objects(tuple(SceneObject(mesh, np.eye(4)) for mesh in kinds), ROUTE, {key: 9}, kinds)
+    assert [entry.mesh for entry in changed] == [9, 3]
+
+
 def test_what_is_refused() -> None:
     with pytest.raises(ConfigError, match="layers and cards need a target"):
         StreetEdit(SceneEdit(layers=(TextureLayer(0),), textures={0: torch.ones(3, 1, 1)}))

@@ -13,6 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import U8, EpisodeLimits
 from ssad.drivers.lane_keeping.driver import CHANNEL, LaneKeeper
+from ssad.drivers.lane_keeping.limit_signs import LIMITS, Plate
 from ssad.drivers.lane_keeping.markings import RoadGrid, RoadMap
 from ssad.drivers.perceiving.driver import LaneEvent
 from ssad.drivers.perceiving.planner import AutopilotPlanner
@@ -20,6 +21,7 @@ from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.metrics.lane_keeping import lane_metrics, lane_position
 from ssad.world.rollout import rollout
 
+PLATE = Plate((200.0, 60.0), 20.0, np.where(np.array(LIMITS) == 20, 0.95, 0.5))
 CAMERA = Camera.typical(320, 192, channel=CHANNEL)
 GRID = RoadGrid(row_step=0.5, column_step=0.1)
 
@@ -87,6 +89,25 @@ def test_it_stays_where_it_sees_no_lane() -> None:
     trace, _, recorder = drive(20, lines=False)
     assert trace.speed[:, 0].max() < 0.1
     assert recorder.lanes[0][-1][1] is None
+
+
+def test_it_drives_at_the_limit_that_it_has_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readings are those of a reader that sees 30 km/h from the second second on."""
+    monkeypatch.setattr("ssad.drivers.lane_keeping.driver.find_plates", lambda image, camera: [PLATE])
+    (scenario,) = load_scenarios("lane-keeping/ProvingGround_straight_00")
+    town = load_town(scenario.town)
+    episode = replace(build_episode(scenario, town, seed=0), limits=EpisodeLimits(max_steps=75))
+    tops = {}
+    for set_speed in (None, 12.0):
+        recorder = PerceptionRecorder({}, 1)
+        driver = LaneKeeper(camera=CAMERA, grid=GRID, watch=recorder, set_speed=set_speed)
+        world = World([episode], {town.name: town})
+        (trace,) = rollout(world, driver, sensors={CHANNEL: DrawnRoad(town)})
+        tops[set_speed] = float(trace.speed[:, 0].max())
+        limits = [limit for _, limit in recorder.limits[0]]
+        assert limits[:1] + limits[5:6] == ([] if set_speed is None else [None, 20])
+    assert tops[12.0] == pytest.approx(20.0 / 3.6, abs=0.4)
+    assert tops[None] > 8.0
 
 
 def test_a_snapshot_keeps_the_lane() -> None:

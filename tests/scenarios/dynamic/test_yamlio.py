@@ -475,9 +475,8 @@ def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     towns, learned = ("natural-crossgate", "natural-twinford"), ("training", "training-lanes")
     drawn = ("natural-uniform", "natural-unselected")
-    shipped = tuple(
-        sorted(("lane-keeping", "lane-traffic", "natural", *towns, *drawn, "precrash", "stop-signs", *learned))
-    )
+    signs = ("speed-signs", "stop-signs")
+    shipped = tuple(sorted(("lane-keeping", "lane-traffic", "natural", *towns, *drawn, "precrash", *signs, *learned)))
     assert set_names() == shipped
     mine = scenario_from({**PLAIN, "name": "mine/0"})
     save_scenarios(ssad_home / "scenarios" / "mine.yaml", mine)

@@ -27,12 +27,13 @@ LIMITS: Final = tuple(range(10, 150, 10))  # km/h
 WHITE: Final = 0.76  # radius of the white disc, as a share of that of the plate
 PLATE: Final = 0.62  # m, diameter that tells the distance of a plate
 CELLS: Final = 28  # side of the square in which figures are compared
+LEFT_EDGE: Final = 0.42  # share of the width from which plates are read: signs stand on the right of the road
 ZOOM: Final = 2  # the upper half of an image is enlarged before plates are located
 SMOOTH: Final = 1.2  # pixels of the enlarged image, before red is told
-MIN_PIXELS: Final = 11.0  # least diameter of a plate in the image
+MIN_PIXELS: Final = 14.0  # least diameter of a plate in the image
 REDNESS: Final = (0.41, 0.46, 0.52)  # thresholds of R / (R + G + B), tried in turn
 FORM: Final = (0.72, 1.39)  # width by height of a hole
-ROUNDNESS: Final = 0.68  # least share of its box that a hole covers; a disc has 0.79
+ROUNDNESS: Final = (0.68, 0.87)  # share of its box that a hole covers; a disc has 0.79, a window 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,8 +46,8 @@ class LimitReading:
         margin: Minimum lead of a limit over the next one in the sum of the correlations of a sign, as a share of it.
     """
 
-    confirm: int = 3
-    score: float = 0.6
+    confirm: int = 2
+    score: float = 0.84
     margin: float = 0.03
 
     def __post_init__(self) -> None:
@@ -87,22 +88,26 @@ def find_plates(image: U8, camera: Camera) -> list[Plate]:
 
     Args:
         image: uint8 [3, H, W], RGB.
-        camera: Its camera; plates stand above the horizon, on either side of the road.
+        camera: Its camera; plates are looked for above the horizon and right of `LEFT_EDGE`.
     """
-    rows = int(min(camera.intrinsic[1, 2] + 0.02 * camera.height, camera.height))
-    picture = np.ascontiguousarray(np.moveaxis(image[:, :rows], 0, -1))
+    horizon_row = int(min(camera.intrinsic[1, 2] + 0.02 * camera.height, camera.height))
+    first_column = int(LEFT_EDGE * camera.width)
+    picture = np.ascontiguousarray(np.moveaxis(image[:, :horizon_row, first_column:], 0, -1))
     enlarged = cv2.resize(picture, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     # The colour filter of the sensor breaks thin rings into dots.
-    smooth = cv2.GaussianBlur(enlarged, (0, 0), SMOOTH)
-    share = smooth[..., 0] / (smooth.sum(-1) + 1.0)
-    lead = smooth[..., 0] - np.maximum(smooth[..., 1], smooth[..., 2])
+    smoothed = cv2.GaussianBlur(enlarged, (0, 0), SMOOTH)
+    red_share = smoothed[..., 0] / (smoothed.sum(-1) + 1.0)
+    red_lead = smoothed[..., 0] - np.maximum(smoothed[..., 1], smoothed[..., 2])
     plates: list[Plate] = []
     for threshold in REDNESS:
-        red = ((share > threshold) & (lead > 8.0)).astype(np.uint8)
-        for x, y, diameter in _round_holes(red):
-            if all(np.hypot(x - p.centre[0], y - p.centre[1]) > 0.5 * p.diameter for p in plates):
-                correlations = _compare(enlarged, x * ZOOM, y * ZOOM, diameter * ZOOM)
-                plates.append(Plate((x, y), diameter, correlations))
+        red_mask = ((red_share > threshold) & (red_lead > 8.0)).astype(np.uint8)
+        for column, row, diameter in _round_holes(red_mask):
+            if all(
+                np.hypot(first_column + column - plate.centre[0], row - plate.centre[1]) > 0.5 * plate.diameter
+                for plate in plates
+            ):
+                correlations = _compare(enlarged, column * ZOOM, row * ZOOM, diameter * ZOOM)
+                plates.append(Plate((first_column + column, row), diameter, correlations))
     return plates
 
 
@@ -117,24 +122,24 @@ def _round_holes(red: U8) -> list[tuple[float, float, float]]:
         diameter = 0.5 * (width + height) / WHITE / ZOOM
         if parent < 0 or diameter < MIN_PIXELS or not FORM[0] < width / max(height, 1) < FORM[1]:
             continue
-        if cv2.contourArea(contour) > ROUNDNESS * (width * height):
+        if ROUNDNESS[0] < cv2.contourArea(contour) / (width * height) < ROUNDNESS[1]:
             holes.append(((x + 0.5 * width) / ZOOM, (y + 0.5 * height) / ZOOM, diameter))
     return holes
 
 
 def _compare(picture: F32, x: float, y: float, diameter: float) -> F64:
     """Return the correlation of a plate with the figures of each limit; the best of nine places and three sizes."""
-    grey = picture.mean(-1)
-    best = np.full(len(LIMITS), -1.0)
+    grey_image = picture.mean(-1)
+    highest = np.full(len(LIMITS), -1.0)
     for size in (0.94, 1.0, 1.06):
-        side = size * diameter * WHITE
-        templates, weights = _templates(min(round(side / ZOOM), 64))
-        for dx, dy in ((i, j) for i in (-0.04, 0.0, 0.04) for j in (-0.04, 0.0, 0.04)):
-            left, top = x + dx * diameter - 0.5 * side, y + dy * diameter - 0.5 * side
-            scale = side / CELLS
-            matrix = np.array([[scale, 0.0, left + 0.5 * scale - 0.5], [0.0, scale, top + 0.5 * scale - 0.5]])
+        disc_side = size * diameter * WHITE
+        templates, weights = _templates(min(round(disc_side / ZOOM), 64))
+        for shift_x, shift_y in ((i, j) for i in (-0.04, 0.0, 0.04) for j in (-0.04, 0.0, 0.04)):
+            left_edge, top_edge = x + shift_x * diameter - 0.5 * disc_side, y + shift_y * diameter - 0.5 * disc_side
+            scale = disc_side / CELLS
+            matrix = np.array([[scale, 0.0, left_edge + 0.5 * scale - 0.5], [0.0, scale, top_edge + 0.5 * scale - 0.5]])
             square = cv2.warpAffine(
-                grey,
+                grey_image,
                 matrix,
                 (CELLS, CELLS),
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
@@ -142,30 +147,30 @@ def _compare(picture: F32, x: float, y: float, diameter: float) -> F64:
             )
             values = square.astype(np.float64)[weights]
             values -= values.mean()
-            best = np.maximum(best, templates @ values / max(float(np.linalg.norm(values)), 1e-6))
-    return np.asarray(best)
+            highest = np.maximum(highest, templates @ values / max(float(np.linalg.norm(values)), 1e-6))
+    return np.asarray(highest)
 
 
 @lru_cache(maxsize=64)
 def _templates(pixels: int) -> tuple[F64, F64]:
     """Return the normalised figures [L, n] of a white disc of so many pixels, and the mask [CELLS, CELLS] of its n."""
-    fine = 280
+    drawing_side = 280
     axis = (np.arange(CELLS) + 0.5) / CELLS * 2.0 - 1.0
     mask = np.hypot(*np.meshgrid(axis, axis)) < 0.9
-    rows = []
+    figure_rows = []
     for limit in LIMITS:
-        drawing = np.full((fine, fine), 255, np.uint8)
+        drawing = np.full((drawing_side, drawing_side), 255, np.uint8)
         for stroke in number_strokes(str(limit), segments=8):
-            points = 0.5 * fine * (1.0 + stroke / WHITE * [1.0, -1.0])
+            points = 0.5 * drawing_side * (1.0 + stroke / WHITE * [1.0, -1.0])
             cv2.fillPoly(drawing, [np.round(points * 16.0).astype(np.int32)], 0, shift=4)
         size = max(pixels, 6)
-        small = cv2.resize(drawing, (size, size), interpolation=cv2.INTER_AREA)
+        small_drawing = cv2.resize(drawing, (size, size), interpolation=cv2.INTER_AREA)
         # The lens and the colour filter spread an edge over about a pixel.
-        small = cv2.GaussianBlur(small, (0, 0), 0.6)
-        square = cv2.resize(small, (CELLS, CELLS), interpolation=cv2.INTER_LINEAR).astype(np.float64)[mask]
+        small_drawing = cv2.GaussianBlur(small_drawing, (0, 0), 0.6)
+        square = cv2.resize(small_drawing, (CELLS, CELLS), interpolation=cv2.INTER_LINEAR).astype(np.float64)[mask]
         square -= square.mean()
-        rows.append(square / np.linalg.norm(square))
-    return np.array(rows), np.asarray(mask)
+        figure_rows.append(square / np.linalg.norm(square))
+    return np.array(figure_rows), np.asarray(mask)
 
 
 class LimitMemory:

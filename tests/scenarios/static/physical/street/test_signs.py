@@ -11,6 +11,8 @@ from ssad.rendering.sensor_suite import SensorSuite
 from ssad.scenarios.static.perturbation import EGO
 from ssad.scenarios.static.physical.street.signs import HEAD_LUMENS, HeadLight, SignChange, near_route
 
+STICKERS = ("sticker-8", "sticker-blank", "sticker-blocks")
+
 
 def test_a_sign_that_changes_is_told_to_sensors_alone() -> None:
     (scenario, *_) = load_scenarios("stop-signs")
@@ -29,6 +31,50 @@ def test_a_sign_that_changes_is_told_to_sensors_alone() -> None:
     (plain,) = load_scenarios("lane-keeping/ProvingGround_straight_00")
     ground = load_town(plain.town)
     assert gone.applies_to(build_episode(plain, ground, seed=0), ground) is None
+
+
+def test_speed_limit_signs_change_by_their_figures() -> None:
+    (scenario, *_) = load_scenarios("stop-signs")
+    town = load_town(scenario.town)
+    episode = build_episode(scenario, town, seed=0)
+    assert SignChange("limit-30").applies_to(episode, town) == EGO
+    assert SignChange("limit", "sticker-8").applies_to(episode, town) == EGO
+    assert SignChange("limit-60").applies_to(episode, town) is None
+    assert SignChange("limit", "limit-30").applies_to(episode, town) is None, "it stays the same"
+    gone = SignChange("limit").bodies()
+    assert set(gone.values()) == {None}
+    assert len(gone) == 14
+    assert "limit_sign:80" not in SignChange("limit", "limit-80").bodies()
+    assert "limit_sign:80" not in SignChange("limit", "sticker-8").bodies()
+
+
+def test_a_sticker_and_its_controls_lie_before_the_same_part_of_a_plate() -> None:
+    bodies = {into: SignChange("limit-30", into).bodies()["limit_sign:30"] for into in STICKERS}
+    papers = []
+    for into, body in bodies.items():
+        assert body is not None
+        names = [material.name for material in body.materials]
+        corners = body.corners()
+        paper = corners[body.material == names.index("sticker")].reshape(-1, 3)
+        plate = corners[body.material == names.index("sign_white")].reshape(-1, 3)
+        assert paper[:, 0].min() > plate[:, 0].max()
+        assert paper[:, 1].max() < 0.05, "on the left of who reads"
+        ink = corners[(body.material == names.index("sign_ink")) & (corners[..., 0].min(1) > paper[0, 0])]
+        assert (len(ink) > 0) == (into != "sticker-blank")
+        papers.append(paper)
+    for paper in papers[1:]:
+        np.testing.assert_array_equal(paper, papers[0])
+
+
+def test_a_cover_hides_the_whole_plate() -> None:
+    for sign, kind in (("stop", "stop_sign"), ("yield", "yield_sign"), ("limit-30", "limit_sign:30")):
+        body = SignChange(sign, "cover").bodies()[kind]
+        assert body is not None
+        corners = body.corners()
+        front = corners[corners[..., 0].min(1) > corners[..., 0].max() - 1e-4].reshape(-1, 3)
+        face = corners[body.panel == body.panels.index("face")].reshape(-1, 3)
+        assert (front[:, 1:].min(0) < face[:, 1:].min(0)).all()
+        assert (front[:, 1:].max(0) > face[:, 1:].max(0)).all()
 
 
 def test_the_lamp_on_a_head_lights_its_size() -> None:
@@ -55,6 +101,11 @@ def test_what_is_refused() -> None:
         SignChange("speed")
     with pytest.raises(UnknownNameError):
         SignChange("stop", "moose")
+    with pytest.raises(ConfigError, match="stop has no figure for sticker-8"):
+        SignChange("stop", "sticker-8")
+    for sign, into in (("limit-80", "sticker-8"), ("limit-80", "limit-80")):
+        with pytest.raises(ConfigError, match="changes nothing"):
+            SignChange(sign, into)
     with pytest.raises(ConfigError, match="changes nothing"):
         SignChange("stop", "stop")
     with pytest.raises(UnknownNameError):
