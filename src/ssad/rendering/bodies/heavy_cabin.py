@@ -34,7 +34,7 @@ BUS_EYES = 0.55  # share of a bus's height: middle of the driver's head
 SEATED = {"city": 0.535, "bendy": 0.54, "coach": 0.655}  # share of a bus's height: heads of seated passengers
 STANDING = 0.605  # share of a bus's height: heads of those who stand in a city bus
 SEAT_PITCH = 0.80  # m between two rows of seats
-TAKEN = (0.15, 0.8)  # share of the seats with a passenger
+OCCUPANCY = (0.15, 0.8)  # share of the seats with a passenger
 STANDS = 0.3  # of the places beside a seat of a city bus, at most: somebody stands there
 
 
@@ -57,34 +57,36 @@ def truck_cab(shell: Shell, size: Point, body: Mesh, *, detail: int, share: floa
     windscreen = pane_of(front)
     corner_count = 8 if detail == 2 else 6
     if windscreen is not None:
-        seat_y, eyes = 0.56 * windscreen.half_width(0.5), windscreen.up(CAB_EYES)
+        seat_y, eye_height = 0.56 * windscreen.half_width(0.5), windscreen.up(CAB_EYES)
         seats: list[Outline] = []
         for y in (seat_y, -seat_y):
-            seats += _torso(y, eyes, windscreen.up(0.06), width=SHOULDER + 0.02)
-            seats.append(ellipse((y, eyes + 0.02), (0.14, 0.15), corner_count))
+            seats += _torso(y, eye_height, windscreen.up(0.06), width=SHOULDER + 0.02)
+            seats.append(ellipse((y, eye_height + 0.02), (0.14, 0.15), corner_count))
         pieces += [
             (seats, CLOTH, LAYER),
             (windscreen.band(0.02, 0.13, 0.94), BOARD, 4 * LAYER),
         ]
         if driver is not None:
-            pieces += _person(seat_y, eyes, windscreen.up(0.06), driver, corner_count, lift=2 * LAYER)
+            pieces += _person(seat_y, eye_height, windscreen.up(0.06), driver, corner_count, lift=2 * LAYER)
         meshes += patches(front, pieces)
     edges = window_edges(shell, size, *shell.windows[0])
     if edges is None:
         return meshes
     front_edge, rear_edge = edges
-    low, high = float(rear_edge[0, 1]), float(rear_edge[1, 1])
+    lower_edge, upper_edge = float(rear_edge[0, 1]), float(rear_edge[1, 1])
     seat_x = float(rear_edge[0, 0]) + 0.30
-    eyes = low + CAB_EYES * (high - low)
+    eye_height = lower_edge + CAB_EYES * (upper_edge - lower_edge)
     beyond = rectangle(
-        (float(rear_edge[0, 0]) + 0.08, low + 0.32 * (high - low)),
-        (float(front_edge[0, 0]) - 0.12, low + 0.90 * (high - low)),
+        (float(rear_edge[0, 0]) + 0.08, lower_edge + 0.32 * (upper_edge - lower_edge)),
+        (float(front_edge[0, 0]) - 0.12, lower_edge + 0.90 * (upper_edge - lower_edge)),
     )
-    seat = _torso(seat_x - 0.10, eyes, low, width=0.14)
+    seat = _torso(seat_x - 0.10, eye_height, lower_edge, width=0.14)
     for view in ("left", "right"):
         side_pieces: list[Piece] = [(beyond, BEYOND, LAYER), (seat, SEAT, 2 * LAYER)]
         if driver is not None:
-            side_pieces += _person(seat_x + 0.08, eyes, low, driver, corner_count, lift=3 * LAYER, width=0.17)
+            side_pieces += _person(
+                seat_x + 0.08, eye_height, lower_edge, driver, corner_count, lift=3 * LAYER, width=0.17
+            )
         meshes += patches(Surface(panes, view), side_pieces)
     return meshes
 
@@ -113,7 +115,7 @@ def bus_interior(
         has_driver: Whether there are people on the bus.
     """
     draws = generator("passengers", style, is_first, share)
-    taken = float(draws.uniform(*TAKEN)) if has_driver else 0.0
+    occupancy = float(draws.uniform(*OCCUPANCY)) if has_driver else 0.0
     panes = _panes(body)
     corner_count = 8 if detail == 2 else 6
     seated_height = SEATED[style] * size[2]
@@ -127,66 +129,84 @@ def bus_interior(
             if edges is None or any(start < door_end and door_start < end for door_start, door_end in doors):
                 continue
             front_edge, rear_edge = edges
-            low, high = float(max(front_edge[0, 1], rear_edge[0, 1])), float(min(front_edge[1, 1], rear_edge[1, 1]))
+            lower_edge, upper_edge = (
+                float(max(front_edge[0, 1], rear_edge[0, 1])),
+                float(min(front_edge[1, 1], rear_edge[1, 1])),
+            )
             rear_x, front_x = axle_x(shell, size, end) + 0.05, axle_x(shell, size, start) - 0.05
-            if high - low < 0.3 or front_x - rear_x < 0.3:
+            if upper_edge - lower_edge < 0.3 or front_x - rear_x < 0.3:
                 continue
             pieces.append(
-                (rectangle((rear_x, low + 0.22 * (high - low)), (front_x, low + 0.86 * (high - low))), FAR_SIDE, LAYER)
+                (
+                    rectangle(
+                        (rear_x, lower_edge + 0.22 * (upper_edge - lower_edge)),
+                        (front_x, lower_edge + 0.86 * (upper_edge - lower_edge)),
+                    ),
+                    FAR_SIDE,
+                    LAYER,
+                )
             )
             if is_first and index == 0:
                 if has_driver:
                     driver = DriverColours.from_share(float(draws.random()))
                     middle = 0.5 * (rear_x + front_x)
-                    pieces += _person(middle, BUS_EYES * size[2], low, driver, corner_count, lift=4 * LAYER, width=0.17)
+                    pieces += _person(
+                        middle, BUS_EYES * size[2], lower_edge, driver, corner_count, lift=4 * LAYER, width=0.17
+                    )
                 continue
             row_count = max(int((front_x - rear_x) / SEAT_PITCH), 1)
             for row in range(row_count):
                 x = rear_x + (row + 0.5) * (front_x - rear_x) / row_count
-                pieces.append((_torso(x - 0.22, seated_height - 0.06, low, width=0.06), SEAT, 3 * LAYER))
-                stands, sits, colour, offset = draws.random(4).tolist()
+                pieces.append((_torso(x - 0.22, seated_height - 0.06, lower_edge, width=0.06), SEAT, 3 * LAYER))
+                standing_draw, sitting_draw, colour, offset = draws.random(4).tolist()
                 people = DriverColours.from_share(colour)
-                if style != "coach" and stands < STANDS * taken:
+                if style != "coach" and standing_draw < STANDS * occupancy:
                     height = (STANDING + 0.03 * (offset - 0.5)) * size[2]
-                    pieces += _person(x + 0.25, height, low, people, corner_count, lift=2 * LAYER)
-                elif sits < taken:
+                    pieces += _person(x + 0.25, height, lower_edge, people, corner_count, lift=2 * LAYER)
+                elif sitting_draw < occupancy:
                     height = seated_height + 0.10 * (offset - 0.5)
-                    pieces += _person(x + 0.02, height, low, people, corner_count, lift=4 * LAYER, width=0.17)
+                    pieces += _person(x + 0.02, height, lower_edge, people, corner_count, lift=4 * LAYER, width=0.17)
         meshes += patches(Surface(panes, view), pieces)
     if is_first:
-        meshes += _bus_front(panes, size, draws, taken=taken, corner_count=corner_count, has_driver=has_driver)
+        meshes += _bus_front(panes, size, draws, occupancy=occupancy, corner_count=corner_count, has_driver=has_driver)
     return meshes
 
 
 def _bus_front(
-    panes: Mesh, size: Point, draws: np.random.Generator, *, taken: float, corner_count: int, has_driver: bool
+    panes: Mesh, size: Point, draws: np.random.Generator, *, occupancy: float, corner_count: int, has_driver: bool
 ) -> list[Mesh]:
     """Windscreen of a bus: dashboard and driver, passengers behind, before the light of the rear window."""
     surface = Surface(panes, "front")
     windscreen = pane_of(surface)
     if windscreen is None:
         return []
-    seat_y, eyes, base = 0.58 * windscreen.half_width(0.5), BUS_EYES * size[2], windscreen.up(0.05)
+    seat_y, eye_height, base = 0.58 * windscreen.half_width(0.5), BUS_EYES * size[2], windscreen.up(0.05)
     pieces: list[Piece] = [
-        (rectangle((-0.42, eyes - 0.05), (0.42, eyes + 0.38)), FAR_SIDE, LAYER),
+        (rectangle((-0.42, eye_height - 0.05), (0.42, eye_height + 0.38)), FAR_SIDE, LAYER),
         (windscreen.band(0.01, 0.10, 0.94), BOARD, 5 * LAYER),
     ]
     seats = [
-        *_torso(seat_y, eyes, base, width=SHOULDER + 0.02),
-        ellipse((seat_y, eyes + 0.02), (0.13, 0.15), corner_count),
+        *_torso(seat_y, eye_height, base, width=SHOULDER + 0.02),
+        ellipse((seat_y, eye_height + 0.02), (0.13, 0.15), corner_count),
     ]
     pieces.append((seats, CLOTH, 3 * LAYER))
     # Further back, passengers look smaller.
     for y in (-0.75, -0.42, 0.40):
-        sits, colour, offset = draws.random(3).tolist()
-        if sits < taken:
+        sitting_draw, colour, offset = draws.random(3).tolist()
+        if sitting_draw < occupancy:
             people = DriverColours.from_share(colour)
             pieces += _person(
-                y + 0.1 * (offset - 0.5), eyes - 0.05, eyes - 0.45, people, corner_count, lift=2 * LAYER, scale=0.7
+                y + 0.1 * (offset - 0.5),
+                eye_height - 0.05,
+                eye_height - 0.45,
+                people,
+                corner_count,
+                lift=2 * LAYER,
+                scale=0.7,
             )
     if has_driver:
         driver = DriverColours.from_share(float(draws.random()))
-        pieces += _person(seat_y, eyes, base, driver, corner_count, lift=4 * LAYER)
+        pieces += _person(seat_y, eye_height, base, driver, corner_count, lift=4 * LAYER)
     return patches(surface, pieces)
 
 
@@ -195,18 +215,20 @@ def _panes(body: Mesh) -> Mesh:
     return part_of(body, is_glass)
 
 
-def _torso(across: float, eyes: float, low: float, *, width: float) -> list[Outline]:
+def _torso(across: float, eye_height: float, lower_edge: float, *, width: float) -> list[Outline]:
     """Return shoulders and chest below a head, down to a height; nothing if they lie below it."""
-    top = eyes - SHOULDER_DROP
-    if top < low + 0.02:
+    top = eye_height - SHOULDER_DROP
+    if top < lower_edge + 0.02:
         return []
-    return trapezoid((across - width, low), (across + width, top), (across - 0.72 * width, across + 0.72 * width))
+    return trapezoid(
+        (across - width, lower_edge), (across + width, top), (across - 0.72 * width, across + 0.72 * width)
+    )
 
 
 def _person(
     across: float,
-    eyes: float,
-    low: float,
+    eye_height: float,
+    lower_edge: float,
     colours: DriverColours,
     corner_count: int,
     *,
@@ -215,8 +237,8 @@ def _person(
     scale: float = 1.0,
 ) -> list[Piece]:
     """Return the pieces of a person: chest and head."""
-    head = ellipse((across, eyes), (scale * HEAD[0], scale * HEAD[1]), corner_count)
+    head = ellipse((across, eye_height), (scale * HEAD[0], scale * HEAD[1]), corner_count)
     return [
-        (_torso(across, eyes, low, width=scale * width), colours.shirt, lift),
+        (_torso(across, eye_height, lower_edge, width=scale * width), colours.shirt, lift),
         ([head], colours.skin, lift + 0.5 * LAYER),
     ]

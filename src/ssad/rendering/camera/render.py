@@ -635,10 +635,10 @@ def view_noise(view: View, device: str = "cpu") -> F32 | None:
         return None
     if not view.sensor.mosaic:
         raise ConfigError("noise of single photosites needs a sensor with a mosaic")
-    noise = wp.empty((view.camera.height, view.camera.width), dtype=float, device=device)
-    wp.launch(sensing.draw_noise, dim=noise.shape, inputs=[view.seed], outputs=[noise], device=device)
-    drawn: F32 = noise.numpy()
-    return drawn
+    device_noise = wp.empty((view.camera.height, view.camera.width), dtype=float, device=device)
+    wp.launch(sensing.draw_noise, dim=device_noise.shape, inputs=[view.seed], outputs=[device_noise], device=device)
+    host_noise: F32 = device_noise.numpy()
+    return host_noise
 
 
 def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:

@@ -444,7 +444,7 @@ def test_a_texture_is_trained_against_a_3d_detector(tmp_path: Path) -> None:
     given = suite(
         detectors=["fcos3d-light"],
         attacks=[{"name": "vanishing", "settings": {"batch": 2}}],
-        epochs=3,
+        epochs=12,
         window=192,
         pairs=[PAIR | {"test_images": 1}],
     )

@@ -94,8 +94,9 @@ class Flashlight:
 
     def power(self, values: Mapping[str, float]) -> float:
         """Return the luminous flux behind the filter, lumen."""
-        red, green, blue = LUMINANCE
-        return values["lumens"] * (red * values["red"] + green * values["green"] + blue * values["blue"])
+        red_weight, green_weight, blue_weight = LUMINANCE
+        luminance = red_weight * values["red"] + green_weight * values["green"] + blue_weight * values["blue"]
+        return values["lumens"] * luminance
 
 
 _IDENTITY: F64 = first_array(torch.eye(4, dtype=torch.float64)[None])
