@@ -165,8 +165,8 @@ def effects() -> list[str]:
     return [
         "## Cost of the effects",
         "",
-        "Measured by `benchmarks/effect_cost.py` on one core, on the street of `benchmarks/camera_speed.py`: medians of",
-        "pairs of pictures without any effect and with all of them.",
+        "Measured by `benchmarks/effect_cost.py` on one core, on the street of `benchmarks/camera_speed.py`: medians",
+        "of pairs of pictures without any effect and with all of them.",
         "",
         "| view | without, ms | with all, ms | more |",
         "|---|---:|---:|---:|",
