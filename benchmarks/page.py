@@ -159,6 +159,30 @@ def camera() -> list[str]:
     ]
 
 
+def effects() -> list[str]:
+    """Cost of the effects of the rendering."""
+    views, loop = read("effects-cpu"), read("effects-loop-cpu")
+    return [
+        "## Cost of the effects",
+        "",
+        "Measured by `benchmarks/effect_cost.py` on one core, on the street of `benchmarks/camera_speed.py`: medians",
+        "of pairs of pictures without any effect and with all of them.",
+        "",
+        "| view | without, ms | with all, ms | more |",
+        "|---|---:|---:|---:|",
+        *(
+            f"| {name} | {view['ms_without']:.0f} | {view['ms_without'] + view['all']['ms']:.0f} "
+            f"| {view['all']['ratio']:.0%} |"
+            for name, view in views.items()
+        ),
+        "",
+        f"In the closed loop (`--scenes`), a step of {loop['scenes']} natural episodes with a camera of 640 x 384 each",
+        f"takes {loop['ratio']:.2f} times as long with all effects as with `lit-signals` alone, probes of new places",
+        f"included (median of {loop['steps']} pairs).",
+        "",
+    ]
+
+
 def sensor() -> list[str]:
     """Time of the sensor, in the renderer and in torch."""
     found = read("sensor-cpu")
@@ -327,7 +351,7 @@ def page() -> str:
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
     lines += beside()
-    lines += shifts() + scores() + camera() + sensor() + recorder() + detectors() + attacks()
+    lines += shifts() + scores() + camera() + effects() + sensor() + recorder() + detectors() + attacks()
     return "\n".join(lines)
 
 
