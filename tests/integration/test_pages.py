@@ -41,7 +41,9 @@ def test_a_result_begins_with_commit_weights_versions_and_command(name: str) -> 
     assert "ssad run" not in header["command"] or "`ssad report DIR --markdown`" in header["command"]
 
 
-@pytest.mark.parametrize(("script", "name"), [("page", "speed"), ("detector_accuracy", "accuracy")])
+@pytest.mark.parametrize(
+    ("script", "name"), [("page", "speed"), ("detector_accuracy", "accuracy"), ("frames", "pictures")]
+)
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
     assert page == (ROOT / "docs" / "results" / f"{name}.md").read_text(), f"run python -m benchmarks.{script}"
