@@ -120,15 +120,14 @@ VIEWS = {
         "Far street",
         "training/Oldmarket/RedlightRunning/03",
         178,
-        "The far end of the street is paler in the haze; benches, plants and shop windows with goods are new. The "
-        "white walls still look alike.",
+        "Benches, plants, parking bays and shop windows with goods are new. Haze over such a distance hardly shows.",
     ),
     "junction": FrameView(
         "Junction with signals",
         "natural/Crossgate_68/04",
         59,
         "The lit lens has the green of a signal, and the other two are dark. Signals for walkers show their state. The "
-        "cars have people and spokes, and the offices mirror each other.",
+        "cars have people and spokes, and the glass of the offices mirrors what is around.",
     ),
     "motorway": FrameView(
         "Motorway",
@@ -170,7 +169,7 @@ FLAWS = {
     "Signal heads": "The lit lens is a polygon of one flat green, without the pattern of light sources and without a "
     "glow by day.",
     "Fine lines": "Distant markings, thin frames of windows and the edges of leaves have blue and orange pixels, "
-    "because the mosaic of the sensor has no optical filter before it (junction, motorway).",
+    "which the mosaic of the sensor makes of them (junction, motorway).",
     "Sky": "Clouds are a few blurred wisps of one kind.",
 }
 """Faults that are visible in the frames after, by what shows them."""
@@ -233,8 +232,8 @@ def page() -> str:
         "then `python benchmarks/frames.py --page`.",
         "",
         f"Eight frames of the front camera, {SIZE[0]} x {SIZE[1]} pixels, with the default quality and the default "
-        "sensor, before and after the [effects of the rendering](../reference/camera.md). Each is a step of a drive "
-        "of `autopilot`. Driving did not change, so camera and traffic of a pair are in the same place. Streets are "
+        "sensor, before and after the [effects of the rendering](../reference/camera.md) and the new bodies, "
+        "plants and streets. Each is a step of a drive of `autopilot`. Driving did not change, so camera and traffic of a pair are in the same place. Streets are "
         "built anew, with other buildings and trees. Each frame opens at full size.",
     ]
     for name, view in VIEWS.items():
