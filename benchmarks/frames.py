@@ -233,7 +233,8 @@ def page() -> str:
         "",
         f"Eight frames of the front camera, {SIZE[0]} x {SIZE[1]} pixels, with the default quality and the default "
         "sensor, before and after the [effects of the rendering](../reference/camera.md) and the new bodies, "
-        "plants and streets. Each is a step of a drive of `autopilot`. Driving did not change, so camera and traffic of a pair are in the same place. Streets are "
+        "plants and streets. Each is a step of a drive of `autopilot`. Driving did not change, so camera and "
+        "traffic of a pair are in the same place. Streets are "
         "built anew, with other buildings and trees. Each frame opens at full size.",
     ]
     for name, view in VIEWS.items():
