@@ -2,8 +2,8 @@
 
 RUN is what `ssad run physical` wrote. For each attack that was trained against a detector and scored on it, NAME.png
 and NAME.json go to src/ssad/scenarios/static/physical/textures/trained; suites then name them (`texture: NAME`). What
-did not beat the controls is left out, and what inks cannot print too: the run's own records decide. Of an attack in
-several sizes the last that did ships.
+did not beat the controls, and what inks cannot print, is left out: the run's own records decide. Of an attack in
+several sizes the last that passes ships.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         if not line["spec"].get("inks") or line.get("outside_gamut") != 0.0:
             outside = line.get("outside_gamut")
             reason = (
-                "no tones of inks" if outside is None else f"{outside:.1%} of its texels outside the gamut of the inks"
+                f"{outside:.1%} of its texels outside the gamut of the inks" if outside else "not trained with inks"
             )
             print(f"{title} in {line['test']} cannot be printed ({reason}): left out")
             continue

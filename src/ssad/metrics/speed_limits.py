@@ -12,11 +12,11 @@ from ssad.core.types import F64, EpisodeTrace, LaneType
 from ssad.metrics.lane_keeping import lane_position
 
 SETTLING: Final = 4.0  # s after the first sign, in which a driver may still change its speed
-KMH: Final = 3.6  # km/h of 1 m/s
+KMH: Final = 3.6  # km/h for 1 m/s
 
 
 def posted_limits(trace: EpisodeTrace, graph: LaneGraph) -> F64:
-    """Return the limit that signs post for the lane under the ego at each step [T], km/h: rounded to 10."""
+    """Return the limit that signs post for the ego's lane at each step [T], km/h, rounded to 10."""
     is_driving = np.repeat(graph.kind == LaneType.DRIVING, np.diff(graph.offset))
     points = graph.xy[is_driving].astype(np.float64)
     limits = np.repeat(graph.speed_limit, np.diff(graph.offset))[is_driving].astype(np.float64)
@@ -37,15 +37,15 @@ def limit_metrics(
     Args:
         trace: The drive.
         graph: Its town.
-        limits: Time, s, and the limit that the driver has read so far, km/h, of its steps.
+        limits: Time, s, of each step, and the limit that the driver has read by then, km/h.
         first_sign: Distance along the route to the first speed-limit sign, m; None: there is none.
 
     Returns:
-        limit_known: Share of the steps behind the first sign in which the limit that it has read is the posted one.
+        limit_known: Share of the steps past the first sign in which the limit that it has read is the posted one.
         limit_error: Mean absolute difference of the two there, km/h; steps without a reading do not count.
         speeding: Mean speed above the posted limit from `SETTLING` after the first sign on, km/h; slower speeds are 0.
         speeding_max: Greatest speed above it there, km/h.
-        All are NaN if the drive does not come so far.
+        All are NaN if the drive does not reach the first sign.
     """
     names = ("limit_known", "limit_error", "speeding", "speeding_max")
     behind = np.flatnonzero(lane_position(trace, graph).along >= (np.inf if first_sign is None else first_sign))

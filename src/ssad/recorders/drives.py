@@ -155,9 +155,9 @@ def drive_signals(
 ) -> dict[int, SignalState]:
     """Return the states that signals are forced to, so that the ego need not stand at red for long.
 
-    All signals follow their programs, except at junctions that the ego reaches at the wrong moment: there its phase
-    stays green and the others stay red. Programs start with the drive, so that short drives would all show the same
-    states. In those, each junction stays as it is at a drawn moment.
+    All signals follow their programs until the first junction that the ego reaches at the wrong moment: there, and at
+    the junctions of its route after it, its phase stays green and the others stay red. Programs start with the drive,
+    so that short drives would all show the same states. In those, each junction stays as it is at a drawn moment.
 
     Args:
         graph: Lane graph of the town.

@@ -55,7 +55,7 @@ class Recipe:
         grey: Probability of an image without colour.
         clutter: Largest contrast of random texture that is laid over parts of an image. Its amplitude falls with the
             inverse of the spatial frequency, as that of photographs does (Field 1987). Rendered surfaces are smoother
-            than real ones; a detector that has seen smooth ones alone takes texture for objects.
+            than real ones; a detector that has seen smooth ones alone can take texture for objects.
         keep: Least visible share of a box after a crop, 2D only (a 3D box stays while its middle is in sight).
         rare: Images with a class that fewer than this share of them show are repeated (`repetition_counts`); 0:
             none.

@@ -472,7 +472,7 @@ def _row(state: WorldState, *, turn_signals: bool) -> dict[str, npt.NDArray[np.g
 def _trace(
     simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: int, steps: int, *, all_signals: bool
 ) -> EpisodeTrace:
-    """Of scene b, from the steps of all scenes [T, B, ...]."""
+    """Return the trace of scene b from the steps of all scenes [T, B, ...]."""
     episode = simulator.episodes[simulator.assigned[b]]
     graph = simulator.graphs[episode.town]
     state = simulator.state()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ssad.rendering.camera.probes import MOST_PROBES, PROBES_IN_MEMORY, ProbeStore
+from ssad.rendering.camera.probes import MAX_PROBES, PROBES_IN_MEMORY, ProbeStore
 
 
 def missing_probes(store: ProbeStore, places: range) -> int:
@@ -31,6 +31,6 @@ def test_a_long_drive_keeps_few_probes() -> None:
 def test_no_number_of_cameras_fills_the_memory() -> None:
     store = ProbeStore()
     for _ in range(12):
-        missing_probes(store, range(MOST_PROBES + 100))
-    assert len(store.texels) <= MOST_PROBES
-    assert len(store.dropped) <= MOST_PROBES
+        missing_probes(store, range(MAX_PROBES + 100))
+    assert len(store.texels) <= MAX_PROBES
+    assert len(store.dropped) <= MAX_PROBES

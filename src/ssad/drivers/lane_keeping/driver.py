@@ -73,7 +73,7 @@ class LaneKeeper(PerceivingDriver):
         **settings: Further arguments of `PerceivingDriver`.
 
     Raises:
-        ConfigError: A planner is given, or a set speed that is not positive.
+        ConfigError: A planner is given, or a set speed that is not above 0 and at most 70 m/s.
     """
 
     name = "lane-keeper"

@@ -5,8 +5,8 @@
 A plate (C 14 of the Vienna convention) is a bright disc that red surrounds, so it is a round hole in the mask of red
 pixels, also in front of a red wall. Figures are compared by normalised cross-correlation with drawings of the figures
 at the size of the plate in the image, which is invariant to brightness and contrast. Location by colour and shape with
-figures by template is the classical design of de la Escalera et al. (1997). The reader gets neither the map nor any
-places of signs.
+figures by template is the classical design of de la Escalera et al. (1997). The reader gets neither the map nor the
+positions of signs.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ssad.rendering.bodies.figures import number_strokes
 
 LIMITS: Final = tuple(range(10, 150, 10))  # km/h
 WHITE: Final = 0.76  # radius of the white disc, as a share of that of the plate
-PLATE: Final = 0.62  # m, diameter that tells the distance of a plate
+PLATE: Final = 0.62  # m, diameter from which the distance of a plate follows
 CELLS: Final = 28  # side of the square in which figures are compared
 LEFT_EDGE: Final = 0.42  # share of the width from which plates are read: signs stand on the right of the road
 ZOOM: Final = 2  # the upper half of an image is enlarged before plates are located
-SMOOTH: Final = 1.2  # pixels of the enlarged image, before red is told
-MIN_PIXELS: Final = 14.0  # least diameter of a plate in the image
+SMOOTH: Final = 1.2  # pixels of the enlarged image, width of the blur before the mask of red
+MIN_PIXELS: Final = 14.0  # minimum diameter of a plate in the image
 REDNESS: Final = (0.41, 0.46, 0.52)  # thresholds of R / (R + G + B), tried in turn
 FORM: Final = (0.72, 1.39)  # width by height of a hole
 ROUNDNESS: Final = (0.68, 0.87)  # share of its box that a hole covers; a disc has 0.79, a window 1
@@ -53,7 +53,7 @@ class LimitReading:
     def __post_init__(self) -> None:
         if self.confirm < 1 or not 0.0 < self.score < 1.0 or not 0.0 <= self.margin < 1.0:
             raise ConfigError(
-                "reading speed limits needs confirm >= 1, a score between 0 and 1 and a margin of 0 to 1, not "
+                "LimitReading needs confirm >= 1, a score between 0 and 1 and a margin from 0 to below 1, not "
                 f"{self.confirm}, {self.score:g} and {self.margin:g}"
             )
 
@@ -112,7 +112,7 @@ def find_plates(image: U8, camera: Camera) -> list[Plate]:
 
 
 def _round_holes(red: U8) -> list[tuple[float, float, float]]:
-    """Return x, y and the diameter of the plates, pixels of the image, whose white discs are holes of a red mask."""
+    """Return x, y and diameter, pixels of the image, of each plate whose white disc is a hole of a red mask."""
     contours, hierarchy = cv2.findContours(red, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     holes = []
     for contour, (_, _, _, parent) in zip(contours, [] if hierarchy is None else hierarchy[0], strict=False):
@@ -153,7 +153,7 @@ def _compare(picture: F32, x: float, y: float, diameter: float) -> F64:
 
 @lru_cache(maxsize=64)
 def _templates(pixels: int) -> tuple[F64, F64]:
-    """Return the normalised figures [L, n] of a white disc of so many pixels, and the mask [CELLS, CELLS] of its n."""
+    """Return the normalised figures [L, n] of each limit and the mask [CELLS, CELLS] of the n cells of a disc."""
     drawing_side = 280
     axis = (np.arange(CELLS) + 0.5) / CELLS * 2.0 - 1.0
     mask = np.hypot(*np.meshgrid(axis, axis)) < 0.9
@@ -174,10 +174,10 @@ def _templates(pixels: int) -> tuple[F64, F64]:
 
 
 class LimitMemory:
-    """Limit that the signs of one drive have told so far.
+    """Speed limit that a driver has read from the signs of a drive so far.
 
     Args:
-        settings: Settings.
+        settings: Settings of the reading.
     """
 
     def __init__(self, settings: LimitReading) -> None:

@@ -137,12 +137,10 @@ class Gap(ScenarioKind):
         Column("departure_time", "time to the departure from the lane", "s", "higher", limits=NOT_NEGATIVE),
         Column("lane_error", "error of the detected middle of the lane", "m", "lower", limits=NOT_NEGATIVE),
         Column("lane_detection_rate", "share of the steps in which the lane was detected", "", "higher", limits=SHARE),
-        Column(
-            "limit_known", "share of the steps behind a sign with the right speed limit", "", "higher", limits=SHARE
-        ),
+        Column("limit_known", "share of the steps past a sign with the right speed limit", "", "higher", limits=SHARE),
         Column("limit_error", "error of the speed limit that was read", "km/h", "lower", limits=NOT_NEGATIVE),
         Column("speeding", "speed above the posted limit", "km/h", "lower", limits=NOT_NEGATIVE),
-        Column("speeding_max", "greatest speed above it", "km/h", "lower", limits=NOT_NEGATIVE),
+        Column("speeding_max", "greatest speed above the posted limit", "km/h", "lower", limits=NOT_NEGATIVE),
     )
     factors = ("system", "perturbation", "severity")
     metric_limits = LIMITS

@@ -68,7 +68,7 @@ LIMITS = {
     "limit_known": "limit known",
     "limit_error": "error of the limit, km/h",
     "speeding": "above the limit, km/h",
-    "speeding_max": "at most, km/h",
+    "speeding_max": "most above the limit, km/h",
 }
 ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
 """Metric of a detector's errors -> setting of a perfect detector."""
@@ -331,7 +331,7 @@ def limit_table(run: Run) -> Table:
         columns=LIMITS,
         metric=_cell,
         condition=lambda lines: not all(math.isnan(metric_of(line, "limit_known")) for line in lines),
-        note="Behind the first speed-limit sign of the route. Known: share of the steps in which the limit of the last "
+        note="Past the first speed-limit sign of the route. Known: share of the steps in which the limit of the last "
         "sign that was read is the posted one. Error: mean difference of the two; steps without a reading do not "
         "count. Above the limit: mean speed above the posted limit from 4 s after the sign on; slower speeds are 0.",
     )

@@ -35,7 +35,7 @@ SEATED = {"city": 0.535, "bendy": 0.54, "coach": 0.655}  # share of a bus's heig
 STANDING = 0.605  # share of a bus's height: heads of those who stand in a city bus
 SEAT_PITCH = 0.80  # m between two rows of seats
 OCCUPANCY = (0.15, 0.8)  # share of the seats with a passenger
-STANDS = 0.3  # of the places beside a seat of a city bus, at most: somebody stands there
+STANDING_SHARE = 0.3  # of the places beside seats of a full city bus at which somebody stands
 
 
 def truck_cab(shell: Shell, size: Point, body: Mesh, *, detail: int, share: float, has_driver: bool) -> list[Mesh]:
@@ -160,7 +160,7 @@ def bus_interior(
                 pieces.append((_torso(x - 0.22, seated_height - 0.06, lower_edge, width=0.06), SEAT, 3 * LAYER))
                 standing_draw, sitting_draw, colour, offset = draws.random(4).tolist()
                 people = DriverColours.from_share(colour)
-                if style != "coach" and standing_draw < STANDS * occupancy:
+                if style != "coach" and standing_draw < STANDING_SHARE * occupancy:
                     height = (STANDING + 0.03 * (offset - 0.5)) * size[2]
                     pieces += _person(x + 0.25, height, lower_edge, people, corner_count, lift=2 * LAYER)
                 elif sitting_draw < occupancy:

@@ -14,8 +14,8 @@ from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, build, merge,
 PAPER: Final = Material("sticker", (0.74, 0.74, 0.73), specular=0.04, gloss=0.25)
 LAYER: Final = 0.004  # m between a plate and what lies on it
 BLOCKS: Final = (4, 7)  # columns and rows of a sticker of blocks
-MARGIN: Final = 0.06  # of the height of a figure by which a sticker is larger
-COVER_SIDE: Final = 2.06  # radii of the plate
+MARGIN: Final = 0.06  # share of the height of a figure by which a sticker extends beyond it
+COVER_SIDE: Final = 2.06  # radii of the plate, side of a cover
 
 
 def apply_sticker(body: Mesh, size: Point, figures: str, content: str) -> Mesh:

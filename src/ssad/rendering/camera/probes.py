@@ -34,7 +34,7 @@ REACH = (20.0, 70.0)  # m up to which the street is drawn in full, and without s
 FAR, FAR_UP = 300.0, 60.0  # m up to which it is drawn at all, to the sides and upwards
 SUN_SIZE, SUN_REACH = 512, 60.0  # texels and m of the shadow map of a probe
 PROBES_IN_MEMORY, VIEWS_IN_MEMORY = 48, 12  # of each scene
-MOST_PROBES = 512  # in memory, where more cameras than `PROBES_IN_MEMORY` take turns
+MAX_PROBES = 512  # in memory, where more cameras than `PROBES_IN_MEMORY` take turns
 
 
 @dataclass(slots=True)
@@ -54,11 +54,11 @@ class ProbeStore:
     capacity: int = PROBES_IN_MEMORY
 
     def keep_texels(self, key: Any, texels: Any) -> None:
-        """Keep a probe, and drop the one whose last use is longest ago if there are too many."""
+        """Keep a probe, and drop the least recently used ones beyond the capacity."""
         if key in self.dropped:
             # A probe that is wanted again soon after it was dropped shows that many cameras take turns.
             del self.dropped[key]
-            self.capacity = min(self.capacity + 1, MOST_PROBES)
+            self.capacity = min(self.capacity + 1, MAX_PROBES)
         self.texels[key] = texels
         while len(self.texels) > self.capacity:
             _keep(self.dropped, self.texels.popitem(last=False)[0], None, self.capacity)

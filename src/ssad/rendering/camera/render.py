@@ -634,7 +634,7 @@ def view_noise(view: View, device: str = "cpu") -> F32 | None:
     if view.sensor.noise == 0.0:
         return None
     if not view.sensor.mosaic:
-        raise ConfigError("noise of single photosites needs a sensor with a mosaic")
+        raise ConfigError("view_noise: the sensor has noise and no mosaic; give the view a sensor with mosaic=True")
     device_noise = wp.empty((view.camera.height, view.camera.width), dtype=float, device=device)
     wp.launch(sensing.draw_noise, dim=device_noise.shape, inputs=[view.seed], outputs=[device_noise], device=device)
     host_noise: F32 = device_noise.numpy()

@@ -121,7 +121,7 @@ def _clear_position(ground: FreeGround, xy: tuple[float, float], yaw: float) -> 
 def place_limit_signs(
     graph: LaneGraph, ground: FreeGround, street_sides: list[Side]
 ) -> list[tuple[float, float, float, float, float]]:
-    """Take the ground of speed-limit signs: after junctions, where a limit changes, and again each `REPEAT` m.
+    """Place speed-limit signs after junctions, where a limit changes, and again every `REPEAT` m; take their ground.
 
     The signs are bodies of their own. They stand at the right-hand edge, with a clear view over `SIGHT` m.
 

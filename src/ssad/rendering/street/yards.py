@@ -29,7 +29,7 @@ MAX_TURN = 0.25  # rad along a yard: yards are straight
 STEP = 3.0  # m to the next attempt where there is no room
 LINE = 0.1  # m, width of the lines
 ROW_ENTRANCE = 8.0  # m, width of the entrance of places along the street; cells are entered everywhere
-LEAST_ENTRANCE = 3.0  # m
+MIN_ENTRANCE = 3.0  # m, width of an entrance
 ENTRANCE_STEP = 0.5  # m between the stations at which the pavement is tested
 TOP = EARTH + 0.024  # m, height of a yard: above the drives and paths of houses
 DEPTHS = (ROW_DEPTH + BACK, CELL_DEPTH + BACK)  # m that yards take
@@ -119,7 +119,7 @@ def entrances(ground: FreeGround, frontages: list[tuple[Side, float, float, floa
         first, last = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
         # The kerb rises to its full height before the next obstacle.
         middle, width = 0.5 * (first + last), min(last - first - 2.0 * RAMP, max_width)
-        if width >= LEAST_ENTRANCE:
+        if width >= MIN_ENTRANCE:
             yard_entrances.append((side.edge.lane, middle - 0.5 * width, middle + 0.5 * width))
     return yard_entrances
 

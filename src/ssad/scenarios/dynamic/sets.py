@@ -17,7 +17,7 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
 UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs", "lane-keeping", "speed-signs")
-"""Unselected traffic, for rates and past stop signs, and marked roads without traffic: for lanes, and past limit signs.
+"""Unselected traffic, for rates and past stop signs; marked roads without traffic, for lanes and past limit signs.
 
 The name of a scenario class does not load these scenarios.
 """

@@ -58,13 +58,13 @@ class PhysicalRun:
         return list(dict.fromkeys((line["attack"], line["carrier"]) for line in self.run.lines))
 
     def clean_lines(self, test: str, view: str, detector: str, carrier: str) -> list[Line]:
-        """Records of the clean images beside a carrier; those of a light are of its hour."""
+        """Return the records of the clean images for a carrier; for a light, those of its hour."""
         hours = {clean_carrier for name, clean_carrier in self.attacks if name == "clean"}
-        own_hours = [hour for hour in hours if f"{carrier}, ".startswith(f"{hour}, ")]
-        return self.lines(test, view, detector, ("clean", own_hours[0] if own_hours else ""))
+        carrier_hours = [hour for hour in hours if f"{carrier}, ".startswith(f"{hour}, ")]
+        return self.lines(test, view, detector, ("clean", carrier_hours[0] if carrier_hours else ""))
 
     def all_lines(self, test: str, view: str, detector: str, carrier: str) -> list[Line]:
-        """Records of everything with a carrier, whatever it was trained against, in the order of the suite."""
+        """Return all records with a carrier, whatever the textures were trained against, in order of the suite."""
         return [
             line
             for (town, seen_from, judge, (_, own_carrier, _)), lines in self.records.items()
