@@ -92,7 +92,7 @@ def measure_candidates(data: Path, candidates: Sequence[tuple[str, str]], name: 
     changes = {detector.partition("=")[0]: change for detector, change in candidates}
     # The log names the architecture beside the label.
     names = {detector.rpartition("@")[2]: detector for detector in changes}
-    records = [row | {"detector": names[row["detector"]]} for row in results.rows if row["status"] == "ok"]
+    records = [dict(row) | {"detector": names[row["detector"]]} for row in results.rows if row["status"] == "ok"]
     log_evaluations(records, weights, name, results.header["data"], changes)
 
 
