@@ -74,17 +74,49 @@ def measure(data: Path, archive: Path | None, name: str, out: Path) -> None:
         ],
     }
     RESULTS.write_text(dump_json(stored | {name: entry}, indent=1) + "\n")
+    log_evaluations(records, weights, name, identity)
+
+
+def measure_candidates(data: Path, candidates: Sequence[tuple[str, str]], name: str, out: Path) -> None:
+    """Log how weights that are not shipped do on a folder of photographs.
+
+    Args:
+        data: Folder of photographs.
+        candidates: Detector of the suite, such as `yolov5n@NAME=FILE`, and what was changed in its training.
+        name: Name of the photographs on the page.
+        out: Folder of results.
+    """
+    detectors = [detector for detector, _ in candidates]
+    results = ssad.run("reality", set={"data": str(data), "detectors": detectors, "textures": []}, out=out, workers=1)
+    weights = {key.partition("=")[0]: value for key, value in results.header["weights"].items()}
+    changes = {detector.partition("=")[0]: change for detector, change in candidates}
+    # The log names the architecture beside the label.
+    names = {detector.rpartition("@")[2]: detector for detector in changes}
+    records = [dict(row) | {"detector": names[row["detector"]]} for row in results.rows if row["status"] == "ok"]
+    log_evaluations(records, weights, name, results.header["data"], changes)
+
+
+def log_evaluations(
+    records: Sequence[Mapping[str, Any]],
+    weights: Mapping[str, str],
+    name: str,
+    identity: Mapping[str, Any],
+    changes: Mapping[str, str] | None = None,
+) -> None:
+    """Append each evaluation on photographs to the log."""
     with LOG.open("a") as log:
         for row in records:
             line = {
                 "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-                "commit": entry["commit"],
+                "commit": commit(),
                 "data": f"{name}, {identity['photographs']} photographs, {identity['hash']}",
                 "detector": row["detector"],
                 "weights": weights[row["detector"]].split()[0],
                 "texture": " ".join(filter(None, (row["texture"], row["pasted"]))),
                 "metrics": row["metrics"],
             }
+            if changes:
+                line["change"] = changes[row["detector"]]
             log.write(dump_json(line) + "\n")
 
 
@@ -189,14 +221,16 @@ def evaluations() -> list[str]:
         f"{len(rows)} evaluations so far, {len(clean)} of them on clean photographs; "
         "`benchmarks/results/reality-log.jsonl` has them all.",
         "",
-        "| Date | Commit | Photographs | Detector | Weights | Recall, % | AP50, % | Wrong boxes |",
-        "|---|---|---|---|---|---:|---:|---:|",
+        "| Date | Commit | Photographs | Detector | Weights | Change of the training | Recall, % | AP50, % | "
+        "Wrong boxes |",
+        "|---|---|---|---|---|---|---:|---:|---:|",
     ]
     for row in clean:
         figures = row["metrics"]
         lines.append(
             f"| {row['date']} | {row['commit'].split()[0]} | {row['data']} | `{row['detector']}` | {row['weights']} | "
-            f"{100 * figures['recall']:.0f} | {100 * figures['AP50']:.0f} | {figures['wrong']:.1f} |"
+            f"{row.get('change', 'as shipped')} | {100 * figures['recall']:.0f} | {100 * figures['AP50']:.0f} | "
+            f"{figures['wrong']:.1f} |"
         )
     return lines
 
@@ -302,9 +336,20 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--human", type=Path, help="archive of @vladmandic/human")
     parser.add_argument("--name", default="street", help="name of the photographs on the page")
     parser.add_argument("--out", type=Path, default=Path("runs/reality"))
+    parser.add_argument(
+        "--candidate",
+        nargs=2,
+        action="append",
+        metavar=("DETECTOR", "CHANGE"),
+        help="log weights that are not shipped, as yolov5n@NAME=FILE, and what was changed in their training",
+    )
     parser.add_argument("--page", action="store_true", help="write the page")
     options = parser.parse_args(words)
-    if options.data:
+    if options.candidate and not options.data:
+        parser.error("name the folder of photographs for --candidate")
+    if options.candidate:
+        measure_candidates(options.data, options.candidate, options.name, options.out)
+    elif options.data:
         measure(options.data, options.human, options.name, options.out)
     if options.page:
         write_page()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.mono3d import lens, some_truth
+from helpers.mono3d import TINY, TINY_PGD, lens, lively, some_truth
 from helpers.training import COLOURS, RECIPE, SIZE, bank, fresh, learn
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,6 +22,7 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError, UnknownNameError
 from ssad.core.tensor_boxes import solid_corners
 from ssad.core.types import U8
+from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import hull, project
 from ssad.training import loop
 from ssad.training.batches import (
@@ -301,6 +302,17 @@ def test_a_picture_that_rises_takes_its_lens_along() -> None:
     now = project(after.solid.centre, after.intrinsic)
     np.testing.assert_allclose(now[:, 0], before[: len(now), 0], atol=1e-4)
     np.testing.assert_allclose(now[:, 1], before[: len(now), 1] + moved[0][1], atol=1e-4)
+
+
+@pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
+def test_a_step_with_doubt_lowers_the_centreness_to_be_learned(config: Mono3DConfig) -> None:
+    detector = lively(config)
+    images = torch.rand(1, 3, 70, 110, generator=torch.Generator().manual_seed(0))
+    truth = some_truth(4, size=(70, 110), focal=90.0)
+    losses = [loop.TrainingStep(detector, amp=False, doubt=doubt)(images, [truth]) for doubt in (0.0, 2.0)]
+    changed = {key for key in losses[0] if not torch.equal(losses[0][key], losses[1][key])}
+    assert "centerness" in changed
+    assert "cls" not in changed
 
 
 def test_losses_are_weighed_by_name() -> None:
