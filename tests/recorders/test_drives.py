@@ -10,7 +10,7 @@ import pytest
 
 from ssad.core.seeding import generator
 from ssad.core.types import EpisodeTrace, Route, SignalState, TurnSignal
-from ssad.recorders.drives import MAX_WAIT, drive_signals, make_drive
+from ssad.recorders.drives import ARRIVAL_MARGIN, MAX_WAIT, drive_signals, make_drive
 from ssad.recorders.nuscenes import drive_with_autopilot
 from ssad.rendering.camera.scene import LampSignal
 from ssad.rendering.vehicle_signals import trace_signals, with_lamps
@@ -24,8 +24,8 @@ SECONDS = 12.0
 
 
 @cache
-def routes() -> tuple[Route, ...]:
-    """Routes of 150 m that start 40 m before a line with a light, where the lane is that long."""
+def routes(length: float = 150.0) -> tuple[Route, ...]:
+    """Routes that start 40 m before a line with a light, where the lane is that long."""
     graph = load_town(TOWN)
     lines = [row for row, signal in enumerate(graph.stop_signal) if not graph.signal_virtual[signal]]
     return tuple(
@@ -33,7 +33,7 @@ def routes() -> tuple[Route, ...]:
             graph,
             int(graph.stop_lane[row]),
             max(float(graph.stop_s[row]) - 40.0, 0.0),
-            150.0,
+            length,
             generator("test route", row),
         )
         for row in lines
@@ -71,6 +71,28 @@ def test_the_ego_has_green_when_it_arrives_or_soon_after_and_the_cross_street_ha
         assert (states[is_green][:, is_crossing] == SignalState.RED).all(), number
     assert kinds[True], "some junctions stand still for the ego"
     assert kinds[False], "others follow their programs"
+
+
+def test_a_junction_that_shows_green_in_time_follows_its_program_whatever_came_before() -> None:
+    graph, speed, kinds = load_town(TOWN), 8.0, Counter[bool]()
+    programs = signal_programs(graph).astype(np.float64)
+    free, never = np.full((1, len(programs)), -1, np.int32), np.full(1, 1e6, np.float32)
+    for number, route in enumerate(routes(400.0)):
+        override = drive_signals(graph, route, speed=speed, seconds=60.0, key=(number,))
+        if not override:
+            continue
+        distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route.xy, axis=0).T))])
+        junction = graph.junction[route.lane]
+        for entry in np.flatnonzero((junction[1:] >= 0) & (junction[1:] != junction[:-1])) + 1:
+            arrival = float(distances[entry]) / speed + speed / 4.0
+            signals = graph.stop_signal[graph.stop_lane == route.lane[entry - 1]]
+            times = (arrival, arrival + ARRIVAL_MARGIN)
+            states = [signal_states(programs[None], free, never, np.array([time]))[0] for time in times]
+            is_green_in_time = all((state[signals] == SignalState.GREEN).all() for state in states)
+            if arrival < 60.0 and len(signals) == 1 and is_green_in_time:
+                kinds[int(signals[0]) in override] += 1
+    assert kinds[False], "some routes have a junction that is green in time"
+    assert not kinds[True]
 
 
 def test_short_drives_show_each_state_and_not_always_the_same() -> None:

@@ -155,9 +155,9 @@ def drive_signals(
 ) -> dict[int, SignalState]:
     """Return the states that signals are forced to, so that the ego need not stand at red for long.
 
-    All signals follow their programs until the first junction that the ego reaches at the wrong moment: there, and at
-    the junctions of its route after it, its phase stays green and the others stay red. Programs start with the drive,
-    so that short drives would all show the same states. In those, each junction stays as it is at a drawn moment.
+    All signals follow their programs, except at junctions that the ego reaches at the wrong moment: there its phase
+    stays green and the others stay red. Programs start with the drive, so that short drives would all show the same
+    states. In those, each junction stays as it is at a drawn moment.
 
     Args:
         graph: Lane graph of the town.
@@ -170,7 +170,8 @@ def drive_signals(
         Signal index of the town -> state; signals that follow their program are omitted.
     """
     programs = signal_programs(graph).astype(np.float64)
-    forced = _drawn_states(graph, programs, generator("drive signals", graph.name, *key)) if seconds < YELLOW else {}
+    is_short = seconds < YELLOW
+    forced = _drawn_states(graph, programs, generator("drive signals", graph.name, *key)) if is_short else {}
     junction = np.where(route.lane >= 0, graph.junction[np.maximum(route.lane, 0)], -1)
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route.xy, axis=0).T))])
     reached_junctions: set[int] = set()
@@ -185,7 +186,7 @@ def drive_signals(
         cycle, green_start, green, _ = programs[ego_signals[0]].tolist()
         time_since_green = (arrival - green_start) % cycle
         is_passable = time_since_green < green - ARRIVAL_MARGIN or time_since_green > cycle - MAX_WAIT
-        if is_passable and not forced:
+        if is_passable and not is_short:
             continue
         for signal in junction_signals.tolist():
             is_ego_phase = graph.signal_phase[signal] == graph.signal_phase[ego_signals[0]]
