@@ -479,8 +479,8 @@ def effects_section(data: dict[str, Any]) -> list[str]:
     ]
     return [
         "The images of this page are older than the effects of the rendering and the streets of today. The shipped "
-        f"weights on images of commit {effects['commit'].split()[0]}, recorded by the same commands with all effects (first: "
-        f"this page; second: today's images): {'; '.join(parts)}.",
+        f"weights on images of commit {effects['commit'].split()[0]}, recorded by the same commands with all effects "
+        f"(first: this page; second: today's images): {'; '.join(parts)}.",
         "",
     ]
 
