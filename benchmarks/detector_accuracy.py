@@ -70,15 +70,15 @@ def commit() -> str:
 
 def weather_of(description: str) -> str:
     """Day, night, wet ... of a scene, from the words that `ssad.recorders.nuscenes.describe_weather` writes."""
-    found = re.search(r"sun (\d+) degrees (above|below) the horizon, clouds (\d+) %", description)
-    if found is None:
+    parts = re.search(r"sun (\d+) degrees (above|below) the horizon, clouds (\d+) %", description)
+    if parts is None:
         raise SystemExit(f"a scene tells no weather: {description}")
-    height = np.radians(float(found[1])) * (1 if found[2] == "above" else -1)
+    height = np.radians(float(parts[1])) * (1 if parts[2] == "above" else -1)
     fog, wet = (re.search(rf"{name} ([\d.]+)", description) for name in ("fog of", "wet road"))
     return weather_name(
         SceneWeather(
             height,
-            clouds=float(found[3]) / 100,
+            clouds=float(parts[3]) / 100,
             fog=float(fog[1]) if fog else 0.0,
             wet=float(wet[1]) / 100 if wet else 0.0,
         )
@@ -129,7 +129,7 @@ class TargetRecording:
         RMS difference of exposed light over their pixels, rendered with and without all bodies, over the standard
         deviation of the sensor's noise there.
         """
-        found = np.full(len(self.image), np.nan)
+        contrasts = np.full(len(self.image), np.nan)
         shown = {file: number for number, file in enumerate(self.files)}
         small = self.small("car")
         wanted = {self.files[number] for number in np.unique(self.image[small])}
@@ -147,8 +147,8 @@ class TargetRecording:
                 for row in np.flatnonzero(small & (self.image == shown[folder / "images" / one.file])):
                     own = picture.tag[0] == labels.tag[np.abs(labels.box - self.box[row]).max(1).argmin()]
                     noise = np.sqrt(np.mean(photons * behind[own] + dark**2))
-                    found[row] = np.sqrt(np.mean((light[own] - behind[own]) ** 2)) / noise
-        return found
+                    contrasts[row] = np.sqrt(np.mean((light[own] - behind[own]) ** 2)) / noise
+        return contrasts
 
     def truth(self, counts: np.ndarray[Any, Any]) -> Boxes2D:
         """Objects of which only some count; the others take detections as crowds do."""
@@ -162,22 +162,22 @@ def load_detector(name: str, device: str, folder: Path | None, **options: Any) -
     )
 
 
-def found_in(name: str, clips: TargetRecording, device: str, folder: Path | None, **options: Any) -> Boxes2D:
+def detections_of(name: str, clips: TargetRecording, device: str, folder: Path | None, **options: Any) -> Boxes2D:
     """All detections of a detector with these options, with the labels of the clips."""
     detector = load_detector(name, device, folder, **options)
     starts = range(0, len(clips.files), 16)
     batches = (np.stack([read_image(file) for file in clips.files[start : start + 16]]) for start in starts)
-    found = detect_2d(detector, map(torch.from_numpy, batches), device=device)
-    assert found.score is not None
+    detections = detect_2d(detector, map(torch.from_numpy, batches), device=device)
+    assert detections.score is not None
     own = [clips.classes.index(c) if c in clips.classes else -1 for c in detector.classes]
-    label = np.array(own, np.int32)[found.label]
+    label = np.array(own, np.int32)[detections.label]
     known = label >= 0
-    return Boxes2D(found.image[known], label[known], found.box[known], found.score[known])
+    return Boxes2D(detections.image[known], label[known], detections.box[known], detections.score[known])
 
 
 def recall(
     clips: TargetRecording,
-    found: Boxes2D,
+    detections: Boxes2D,
     counts: np.ndarray[Any, Any],
     labels: int,
     *,
@@ -185,76 +185,76 @@ def recall(
     iou: float = 0.5,
 ) -> float:
     """Share of the objects that count which a detection with this score and IoU finds."""
-    assert found.score is not None
-    clear = found.score >= least
-    sure = Boxes2D(found.image[clear], found.label[clear], found.box[clear], found.score[clear])
+    assert detections.score is not None
+    clear = detections.score >= least
+    sure = Boxes2D(detections.image[clear], detections.label[clear], detections.box[clear], detections.score[clear])
     matched = match_2d(clips.truth(counts), sure, labels=labels, threshold=iou)
     return float((matched.hit & ~matched.ignored).sum() / matched.truth.sum())
 
 
-def of_target(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, float]:
+def of_target(clips: TargetRecording, detections: Boxes2D, labels: int) -> dict[str, float]:
     """AP50 of what each recording is about, a car or a sign."""
     folder, scores = np.array(clips.folders)[clips.image], {}
     for recording in dict.fromkeys(clips.folders):
         aimed = clips.target & (folder == recording)
         kind = int(clips.label[aimed][0])
-        scores[recording] = float(average_precision(clips.truth(aimed), found, labels=labels)[kind])
+        scores[recording] = float(average_precision(clips.truth(aimed), detections, labels=labels)[kind])
     return scores
 
 
-def small_cars(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, Any]:
+def small_cars(clips: TargetRecording, detections: Boxes2D, labels: int) -> dict[str, Any]:
     """Cars below 24 px: how many are found from each score on, and how often a score of so much is right."""
     car, weather, small = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small("car")
-    matched = match_2d(clips.truth(~clips.crowd), found, labels=labels)
-    assert found.score is not None
+    matched = match_2d(clips.truth(~clips.crowd), detections, labels=labels)
+    assert detections.score is not None
     assert matched.row is not None
-    box, score = found.box[matched.row], found.score[matched.row]
+    box, score = detections.box[matched.row], detections.score[matched.row]
     tiny = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]) < SMALL**2
     tiny &= (matched.label == car) & ~matched.ignored
     by_score = {}
     for low, high in zip(SCORES, (1.01, *SCORES), strict=False):
         own = tiny & (score >= low) & (score < high)
         part = {"boxes": int(own.sum()), "right": float(matched.hit[own].mean()) if own.any() else float("nan")}
-        by_score[f"{low:g}-{high:g}"] = part | {"recall": recall(clips, found, small, labels, least=low)}
+        by_score[f"{low:g}-{high:g}"] = part | {"recall": recall(clips, detections, small, labels, least=low)}
     groups = {"all": small} | {light: small & (weather == light) for light in sorted(set(clips.weather))}
     by_light = {
         light: {
             "objects": int(own.sum()),
-            "clear": recall(clips, found, own, labels),
-            "any": recall(clips, found, own, labels, least=SCORES[-1]),
-            "any, IoU 0.3": recall(clips, found, own, labels, least=SCORES[-1], iou=0.3),
+            "clear": recall(clips, detections, own, labels),
+            "any": recall(clips, detections, own, labels, least=SCORES[-1]),
+            "any, IoU 0.3": recall(clips, detections, own, labels, least=SCORES[-1], iou=0.3),
         }
         for light, own in groups.items()
         if own.any()
     }
-    return {"by score": by_score, "by light": by_light, "by contrast": by_contrast(clips, found, labels)}
+    return {"by score": by_score, "by light": by_light, "by contrast": by_contrast(clips, detections, labels)}
 
 
-def by_contrast(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
+def by_contrast(clips: TargetRecording, detections: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
     """How many small cars are found of those with a low contrast-to-noise ratio, and of the others."""
     small, faint = clips.small("car"), clips.contrast < FAINT
     return {
-        name: {"objects": int(own.sum()), "clear": recall(clips, found, own, labels)}
+        name: {"objects": int(own.sum()), "clear": recall(clips, detections, own, labels)}
         for name, own in (("faint", small & faint), ("others", small & ~faint))
     }
 
 
 def flat_tables(name: str, clips: TargetRecording, device: str, folder: Path | None) -> dict[str, Any]:
     """One 2D detector: AP50 by class and light, recall by size and distance."""
-    found, labels = found_in(name, clips, device, folder), len(clips.classes)
+    detections, labels = detections_of(name, clips, device, folder), len(clips.classes)
     every = ~clips.crowd
-    ap = average_precision(clips.truth(every), found, labels=labels)
+    ap = average_precision(clips.truth(every), detections, labels=labels)
     car = clips.classes.index("car")
     result: dict[str, Any] = {
         "AP50": {c: float(v) for c, v in zip(clips.classes, ap, strict=True) if np.isfinite(v)},
-        "target": of_target(clips, found, labels),
+        "target": of_target(clips, detections, labels),
         "objects": {c: int((every & (clips.label == k)).sum()) for k, c in enumerate(clips.classes)},
     }
     weather = np.array(clips.weather)
     for light in sorted(set(clips.weather)):
-        own, seen = weather[clips.image] == light, weather[found.image] == light
-        assert found.score is not None
-        part = Boxes2D(found.image[seen], found.label[seen], found.box[seen], found.score[seen])
+        own, seen = weather[clips.image] == light, weather[detections.image] == light
+        assert detections.score is not None
+        part = Boxes2D(detections.image[seen], detections.label[seen], detections.box[seen], detections.score[seen])
         truth = Boxes2D(clips.image[own], clips.label[own], clips.box[own], ignore=clips.crowd[own])
         enough = [k for k in range(labels) if (every & own & (clips.label == k)).sum() >= FEW]
         values = average_precision(truth, part, labels=labels)
@@ -270,21 +270,21 @@ def flat_tables(name: str, clips: TargetRecording, device: str, folder: Path | N
             for low, high in pairwise(edges):
                 counts = every & (clips.label == clips.classes.index(kind)) & (values >= low) & (values < high)
                 if counts.sum() >= FEW:
-                    row = {"recall": recall(clips, found, counts, labels), "objects": int(counts.sum())}
+                    row = {"recall": recall(clips, detections, counts, labels), "objects": int(counts.sum())}
                     result.setdefault(f"by {what}", {}).setdefault(kind, {})[f"{low:g}-{high:g}"] = row
     result["recall below 24 px"] = {
-        kind: recall(clips, found, clips.small(kind), labels) for kind in ("car", "pedestrian")
+        kind: recall(clips, detections, clips.small(kind), labels) for kind in ("car", "pedestrian")
     }
-    result["small cars"] = small_cars(clips, found, labels)
-    enlarged = ((width, found_in(name, clips, device, folder, input_width=width)) for width in WIDTHS)
-    for width, own in ((None, found), *enlarged):
-        values = average_precision(clips.truth(every), own, labels=labels)
+    result["small cars"] = small_cars(clips, detections, labels)
+    enlarged = ((width, detections_of(name, clips, device, folder, input_width=width)) for width in WIDTHS)
+    for width, width_detections in ((None, detections), *enlarged):
+        values = average_precision(clips.truth(every), width_detections, labels=labels)
         result.setdefault("enlarged", {})[str(width or "as they are")] = {
             "mean": float(np.nanmean(values)),
-            "target": of_target(clips, own, labels),
-            "small": recall(clips, own, clips.small("car"), labels),
-            "small, any": recall(clips, own, clips.small("car"), labels, least=SCORES[-1]),
-            "people": recall(clips, own, clips.small("pedestrian"), labels),
+            "target": of_target(clips, width_detections, labels),
+            "small": recall(clips, width_detections, clips.small("car"), labels),
+            "small, any": recall(clips, width_detections, clips.small("car"), labels, least=SCORES[-1]),
+            "people": recall(clips, width_detections, clips.small("pedestrian"), labels),
         }
     return result
 
@@ -363,14 +363,14 @@ def pairs(real: BoxTable, seen: BoxTable) -> dict[str, Any]:
 
 def turned(off: Sequence[tuple[str, float, float]]) -> dict[str, dict[str, dict[str, float]]]:
     """By class (without those that look alike from both ends) and distance: how many, and the share turned round."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    shares: dict[str, dict[str, dict[str, float]]] = {}
     for name in dict.fromkeys(c for c in CLASSES if c not in ALIKE):
         for low, high in ((0.0, RINGS[-1]), *pairwise(RINGS)):
             errors = np.array([e for c, d, e in off if c == name and low <= d < high])
             if len(errors) >= FEW:
-                share = {"boxes": len(errors), "turned": float((errors > np.pi / 2).mean())}
-                found.setdefault(name, {})["all" if high - low > 10.0 else f"{low:g}-{high:g}"] = share
-    return found
+                row = {"boxes": len(errors), "turned": float((errors > np.pi / 2).mean())}
+                shares.setdefault(name, {})["all" if high - low > 10.0 else f"{low:g}-{high:g}"] = row
+    return shares
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -84,7 +84,7 @@ def test_lamps_shine_in_lumen_in_the_targets_frame(scene: RenderScene) -> None:
 
 
 def test_textures_are_on_layers_decals_and_lamps(scene: RenderScene) -> None:
-    """What shows no texture is the same to the bit, noise and all, unless the lens scatters light."""
+    """Pixels without a texture are the same to the bit, noise and all, unless the lens scatters light."""
     quality = RenderQuality(effects=ALL_EFFECTS - {"bloom", "flare"})
     white, red = torch.ones(3, 4, 4), torch.tensor([0.9, 0.0, 0.0])[:, None, None].repeat(1, 2, 2)
     ground = DOWN.copy()

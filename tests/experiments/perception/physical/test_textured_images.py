@@ -194,8 +194,8 @@ def test_pictures_are_the_same_alone_and_together(glowing: Path) -> None:
     few = replace(clip, fragments=fragments[fragments["place"] < (least + 20) * width])
     down = clip.image.shape[0] - clip.corner[0] - clip.radiance.shape[0]
     low = replace(clip, corner=(clip.corner[0] + down, clip.corner[1]), image=np.roll(clip.image, down, 0))
-    ready = [one.prepare(SIZES, glow=False) for one in (clip, few, low)]
-    assert len({tuple(one.part.shape) for one in ready}) > 1
+    ready = [image.prepare(SIZES, glow=False) for image in (clip, few, low)]
+    assert len({tuple(image.part.shape) for image in ready}) > 1
     textures = [{k: (v * share).requires_grad_() for k, v in colours().items()} for share in (1.0, 0.5, 0.8)]
 
     def draws(k: int) -> torch.Generator:
@@ -273,6 +273,9 @@ def test_at_night_the_glow_of_a_texture_is_part_of_the_picture(glowing: Path) ->
     (seen,) = recorded_views(glowing, hour=lambda weather, heading: at_hour(weather, "night", heading))
     worn = seen.with_layers(LAYERS[0])
     picture = render(seen.scene, [worn], quality=seen.quality)
+    noiseless = replace(worn, sensor=replace(worn.sensor, noise=0.0))
+    assert visible_part(picture, worn)["noise"].any()
+    assert not visible_part(picture, noiseless)["noise"].any()
     (top, bottom), (left, right) = parse_part(visible_part(picture, worn))["glow"]
     touched = np.divmod(picture.fragments["place"].astype(np.int64), 160)
     assert bottom - top > np.ptp(touched[0]) + 10

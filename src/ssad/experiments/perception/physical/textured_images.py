@@ -385,7 +385,8 @@ def visible_part(picture: Rendering, view: View, device: str = "cpu") -> dict[st
     """
     height, width = picture.radiance.shape[1:3]
     photosite_noise = view_noise(view)
-    assert photosite_noise is not None
+    if photosite_noise is None:  # a sensor without noise
+        photosite_noise = np.zeros((height, width), np.float32)
     part_fragments = picture.fragments.copy()
     scene_light = torch.from_numpy(picture.radiance[:1]).to(device)
     lens_sensor = with_lens_effects(view.sensor, picture.effects)
